@@ -23,7 +23,7 @@ OF_LEARNING = {
 
 
 def ledger_differences() -> Iterator[str]:
-    """Yield a line for each table of the ledger that differs from the records."""
+    """Yield a line for each table of `OF_LEARNING` that differs from the records."""
     for page, name in OF_LEARNING.items():
         text = (CHECKOUT / page).read_text(encoding="utf-8")
         if ledger.fill_page(text, {name: ledger.PAGES[page][name]}) != text:
@@ -31,7 +31,7 @@ def ledger_differences() -> Iterator[str]:
 
 
 def main() -> int:
-    """Print all differences; return the exit status."""
+    """Print all differences, and return the exit status: 1 if there are any, else 0."""
     differences = [*ledger_differences(), *pages.differences(), *prose.differences(sentences.sentences())]
     print("\n".join(differences) if differences else "all figures are those of the records")
     return int(bool(differences))

@@ -42,8 +42,17 @@ Act = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Function from observations [N, C, H, W] uint8 and goals of the same shape to actions [N, A] float32."""
 
 
-def succeeded(policy: Policy, acts: list[Act], episodes: int) -> list[dict[str, float]]:
-    """Run the same episodes by several functions; return success and goal distance at the last step of each, averaged."""
+def run_episodes(policy: Policy, acts: list[Act], episodes: int) -> list[dict[str, float]]:
+    """Run the same episodes with each function.
+
+    Args:
+        policy: Policy, whose environment is used.
+        acts: Functions from observations and goals [`BATCH`, ...] to actions.
+        episodes: Number of episodes.
+
+    Returns:
+        Mean ``success`` and ``goal_distance`` at the last step, for each function.
+    """
     env = policy.env
     reset, step = jaxrl_vis_envs.jit(jax.vmap(env.reset)), jaxrl_vis_envs.jit(jax.vmap(env.step))
     metrics: list[list[Any]] = [[] for _ in acts]
@@ -59,8 +68,13 @@ def succeeded(policy: Policy, acts: list[Act], episodes: int) -> list[dict[str, 
     ]
 
 
-def latency(act: Act, shape: tuple[int, ...]) -> float:
-    """Return the median time of a call with one observation and one goal, s; inputs vary."""
+def measure_latency(act: Act, shape: tuple[int, ...]) -> float:
+    """Return the median time of a call with one observation and one goal, s.
+
+    Args:
+        act: Function to time.
+        shape: Shape of an observation; each of the `CALLS` random inputs is uint8.
+    """
     images = np.random.default_rng(0).integers(0, 256, (CALLS + 20, 2, 1, *shape), np.uint8)
     seconds = []
     for observation, goal in images:
@@ -71,7 +85,7 @@ def latency(act: Act, shape: tuple[int, ...]) -> float:
 
 
 def measure(name: str, episodes: int) -> dict[str, Any]:
-    """Export a policy and evaluate both forms."""
+    """Export a shipped policy to ONNX, evaluate it in JAX and in onnxruntime, and return its row of the record."""
     policy = jaxrl_vis.load_policy(name)
     call = jax.jit(jax.vmap(policy))
 
@@ -81,7 +95,7 @@ def measure(name: str, episodes: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         check = export_run(name, "onnx", Path(folder) / "onnx")
         by_onnx = Model(check.file)
-        rows = succeeded(policy, [by_jax, by_onnx], episodes)
+        rows = run_episodes(policy, [by_jax, by_onnx], episodes)
         shape = policy.observation_spec.shape
         return {
             "name": name,
@@ -91,13 +105,13 @@ def measure(name: str, episodes: int) -> dict[str, Any]:
             "onnx_bytes": check.file.stat().st_size,
             **{f"jax_{key}": value for key, value in rows[0].items()},
             **{f"onnx_{key}": value for key, value in rows[1].items()},
-            "jax_latency_s": latency(by_jax, shape),
-            "onnx_latency_s": latency(by_onnx, shape),
+            "jax_latency_s": measure_latency(by_jax, shape),
+            "onnx_latency_s": measure_latency(by_onnx, shape),
         }
 
 
 def main() -> int:
-    """Measure the named policies, or all, and update the record; return the exit status."""
+    """Measure the named policies, or all, and update the record after each; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="policies; all if none")
     parser.add_argument("--episodes", type=int, default=256)

@@ -99,7 +99,11 @@ def _is_module(name: str) -> bool:
 
 
 def calls() -> list[str]:
-    """Return the frames of own files from the command line to the critic's loss."""
+    """Return the frames of own files from the command line to the critic's loss, as lines ``PATH FUNCTION``.
+
+    Raises:
+        RuntimeError: Training does not call the critic's loss.
+    """
     with tempfile.TemporaryDirectory() as folder:
         code = _RAISE.format(root=str(ROOT), folder=f"{folder}/run")
         done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
@@ -110,7 +114,11 @@ def calls() -> list[str]:
 
 
 def measure(with_calls: bool = True) -> dict[str, Any]:
-    """Compute all figures; counts exclude the stalks unless their names say otherwise."""
+    """Compute all figures by name; counts exclude the stalks product unless their names say otherwise.
+
+    Args:
+        with_calls: Whether to include the calls to the critic's loss, which takes some seconds.
+    """
     files, names = sources(), field_names()
     ours = [path for path in files if not is_of_stalks(path)]
     packages = [path for path in ours if path.relative_to(ROOT).parts[0] != "benchmarks"]
@@ -136,7 +144,7 @@ def measure(with_calls: bool = True) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Print the figures; return the exit status."""
+    """Print the figures, and write them to ``--json`` if given; return 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path, help="a file for the figures")
     parser.add_argument("--without-calls", action="store_true", help="trace nothing")

@@ -48,20 +48,20 @@ class Shell:
     environment: dict[str, str]
     failures: list[str] = dataclasses.field(default_factory=list)
 
-    def type(self, words: str, status: int = 0, shows: str = "", **variables: str) -> str:
+    def run(self, command: str, status: int = 0, shows: str = "", **variables: str) -> str:
         """Run a command line, print the result, and return its output.
 
         Args:
-            words: The command line.
+            command: The command line.
             status: Expected exit status; with 2, the output must be one line.
             shows: Text that the output must contain.
             **variables: Additional environment variables.
         """
         prefix = "".join(f"{name}={shlex.quote(value)} " for name, value in variables.items())
-        print(f"$ {prefix}{words}", flush=True)
+        print(f"$ {prefix}{command}", flush=True)
         start = time.perf_counter()
         done = subprocess.run(
-            ["bash", "-c", words],
+            ["bash", "-c", command],
             cwd=self.folder,
             env=self.environment | variables,
             stdin=subprocess.DEVNULL,
@@ -80,7 +80,7 @@ class Shell:
         verdict = "; ".join(["NOT AS EXPECTED", *problems]) if problems else "as expected"
         print(f"  exit status {done.returncode}, {time.perf_counter() - start:.1f} s: {verdict}", flush=True)
         if problems:
-            self.failures.append(f"{prefix}{words}: {'; '.join(problems)}")
+            self.failures.append(f"{prefix}{command}: {'; '.join(problems)}")
         return output
 
     def activate(self, environment: Path) -> None:
@@ -90,7 +90,7 @@ class Shell:
 
 
 def new_shell(folder: Path, python: Path) -> Shell:
-    """Create a shell in a new folder, with ``python`` as python3, and an empty home folder."""
+    """Create a shell in the new folder ``folder``/work, with ``python`` as python3 and an empty home folder."""
     (folder / "home").mkdir(parents=True)
     (folder / "work").mkdir()
     (folder / "bin").mkdir()
@@ -121,7 +121,7 @@ def puck_push() -> str:
 
 
 def mistakes() -> list[tuple[str, Mapping[str, str]]]:
-    """Return invalid command lines with environment variables; each must fail with one line and exit status 2."""
+    """Return invalid command lines, each with additional environment variables; all must fail with one line and status 2."""
     train = "jaxrl-vis train"
     lines = [
         "jaxrl-vis",
@@ -149,36 +149,41 @@ def mistakes() -> list[tuple[str, Mapping[str, str]]]:
 
 
 def wheel(shell: Shell, python: Path) -> None:
-    """Test the installation of a wheel with pip."""
-    shell.type(f"git clone --quiet {CHECKOUT} source")
-    shell.type(f"{python.name} -m venv .venv")
+    """Test the installation of a wheel with pip, and the program's commands; failures are added to ``shell.failures``.
+
+    Args:
+        shell: Shell of a new user.
+        python: Interpreter of the virtual environment.
+    """
+    shell.run(f"git clone --quiet {CHECKOUT} source")
+    shell.run(f"{python.name} -m venv .venv")
     shell.activate(shell.folder / ".venv")
-    shell.type("pip wheel --quiet --no-deps --wheel-dir dist ./source")
-    shell.type('pip install --quiet "$(ls dist/*.whl)[video]"')
+    shell.run("pip wheel --quiet --no-deps --wheel-dir dist ./source")
+    shell.run('pip install --quiet "$(ls dist/*.whl)[video]"')
     shutil.rmtree(shell.folder / "source")  # leave nothing but the wheel
-    shell.type("pip check")
-    shell.type("jaxrl-vis --version", shows="0.")
-    shell.type("python -m jaxrl_vis --version", shows="0.")
-    shell.type("jaxrl-vis --help", shows="train")
-    shell.type("jaxrl-vis train --help", shows="--env-steps")
-    shell.type("jaxrl-vis doctor", shows="all is well")
-    shell.type("jaxrl-vis envs", shows="VisualFetchReach")
-    shell.type("jaxrl-vis envs --gallery tasks.png && test -s tasks.png")
-    shell.type(f"jaxrl-vis train VisualReacher {TINY} --run-dir runs/tiny && ls runs/tiny", shows="video.gif")
-    shell.type("jaxrl-vis eval runs/tiny", shows="eval/success")
+    shell.run("pip check")
+    shell.run("jaxrl-vis --version", shows="0.")
+    shell.run("python -m jaxrl_vis --version", shows="0.")
+    shell.run("jaxrl-vis --help", shows="train")
+    shell.run("jaxrl-vis train --help", shows="--env-steps")
+    shell.run("jaxrl-vis doctor", shows="all is well")
+    shell.run("jaxrl-vis envs", shows="VisualFetchReach")
+    shell.run("jaxrl-vis envs --gallery tasks.png && test -s tasks.png")
+    shell.run(f"jaxrl-vis train VisualReacher {TINY} --run-dir runs/tiny && ls runs/tiny", shows="video.gif")
+    shell.run("jaxrl-vis eval runs/tiny", shows="eval/success")
     for suffix in ("gif", "mp4"):
-        shell.type(f"jaxrl-vis play runs/tiny --out tiny.{suffix} && test -s tiny.{suffix}")
-    shell.type("jaxrl-vis play runs/tiny --html && test -s runs/tiny/play.html")
-    shell.type("jaxrl-vis train --run-dir runs/tiny --resume")
+        shell.run(f"jaxrl-vis play runs/tiny --out tiny.{suffix} && test -s tiny.{suffix}")
+    shell.run("jaxrl-vis play runs/tiny --html && test -s runs/tiny/play.html")
+    shell.run("jaxrl-vis train --run-dir runs/tiny --resume")
     load = "import jaxrl_vis; print(jaxrl_vis.load_policy('runs/tiny'))"
-    shell.type(f"python -c {shlex.quote(load)}")
+    shell.run(f"python -c {shlex.quote(load)}")
     (shell.folder / "puck_push.py").write_text(puck_push())
-    shell.type(f"jaxrl-vis train puck_push:PuckPush {TINY} --run-dir runs/puck", shows="puck_push:PuckPush")
+    shell.run(f"jaxrl-vis train puck_push:PuckPush {TINY} --run-dir runs/puck", shows="puck_push:PuckPush")
     (shell.folder / "elsewhere").mkdir()
-    shell.type("cd elsewhere && jaxrl-vis eval ../runs/puck", shows="eval/success")
-    shell.type("cd elsewhere && jaxrl-vis play ../runs/puck --out puck.gif && test -s puck.gif")
+    shell.run("cd elsewhere && jaxrl-vis eval ../runs/puck", shows="eval/success")
+    shell.run("cd elsewhere && jaxrl-vis play ../runs/puck --out puck.gif && test -s puck.gif")
     for line, variables in mistakes():
-        shell.type(line, status=2, **variables)
+        shell.run(line, status=2, **variables)
 
 
 def first_commands() -> list[str]:
@@ -201,43 +206,54 @@ def tiny(line: str) -> str:
 
 
 def clone(shell: Shell, python: Path) -> None:
-    """Test the installation of a clone with make, and the commands of docs/start.md."""
-    shell.type(f"git clone --quiet {CHECKOUT} jaxrl-vis")
+    """Test the installation of a clone with make, and the commands of docs/start.md; failures are added to ``shell.failures``.
+
+    Args:
+        shell: Shell of a new user.
+        python: Interpreter of the virtual environment.
+    """
+    shell.run(f"git clone --quiet {CHECKOUT} jaxrl-vis")
     shell.folder /= "jaxrl-vis"
-    shell.type("make help", shows="make train")
+    shell.run("make help", shows="make train")
     tiny_run = f"PRESET=debug RUN_DIR=runs/first PYTHON={python}"
-    shell.type(f"make train {tiny_run} ARGS='--env-steps 400' && ls runs/first", shows="video.gif")
-    shell.type(".venv/bin/python --version", shows=f"Python {python.name.removeprefix('python')}")
+    shell.run(f"make train {tiny_run} ARGS='--env-steps 400' && ls runs/first", shows="video.gif")
+    shell.run(".venv/bin/python --version", shows=f"Python {python.name.removeprefix('python')}")
     shell.activate(shell.folder / ".venv")
     # Extras that the page names next to the commands that need them.
-    shell.type(".uv/bin/uv pip install --quiet '.[tensorboard,wandb]'")
+    shell.run(".uv/bin/uv pip install --quiet '.[tensorboard,wandb]'")
     for line in first_commands():
-        shell.type(tiny(line))
-    untracked = shell.type("git status --porcelain")
+        shell.run(tiny(line))
+    untracked = shell.run("git status --porcelain")
     if untracked.strip():
         shell.failures.append(f"left in the checkout: {' '.join(untracked.split())}")
 
 
 def notebooks(shell: Shell, python: Path, full: bool) -> None:
-    """Test the notebooks, in a separate folder, in a Jupyter without this project."""
-    shell.type(f"{python.name} -m venv .venv")
+    """Test the notebooks, in a separate folder, in a Jupyter without this project; failures are added to ``shell.failures``.
+
+    Args:
+        shell: Shell of a new user.
+        python: Interpreter of the virtual environment.
+        full: Whether to run them in full length.
+    """
+    shell.run(f"{python.name} -m venv .venv")
     shell.activate(shell.folder / ".venv")
-    shell.type("pip install --quiet nbconvert nbclient ipykernel")
-    shell.type(f"git clone --quiet {CHECKOUT} ../address")
+    shell.run("pip install --quiet nbconvert nbclient ipykernel")
+    shell.run(f"git clone --quiet {CHECKOUT} ../address")
     for name in NOTEBOOKS:
         shutil.copy(CHECKOUT / f"notebooks/{name}.ipynb", shell.folder)
     variables = {} if full else {"JAXRL_VIS_NOTEBOOK_FAST": "1"}
     execute = "jupyter nbconvert --execute --to html --ExecutePreprocessor.timeout=7200"
-    shell.type(f"{execute} {NOTEBOOKS[0]}.ipynb", status=1, shows="set REPOSITORY in this cell")
+    shell.run(f"{execute} {NOTEBOOKS[0]}.ipynb", status=1, shows="set REPOSITORY in this cell")
     missing = str(shell.folder.parent / "missing")
-    shell.type(f"{execute} {NOTEBOOKS[0]}.ipynb", status=1, shows="could not clone", JAXRL_VIS_REPOSITORY=missing)
+    shell.run(f"{execute} {NOTEBOOKS[0]}.ipynb", status=1, shows="could not clone", JAXRL_VIS_REPOSITORY=missing)
     for name in NOTEBOOKS:
-        shell.type(f"{execute} {name}.ipynb", JAXRL_VIS_REPOSITORY=f"file://{shell.folder.parent / 'address'}", **variables)
+        shell.run(f"{execute} {name}.ipynb", JAXRL_VIS_REPOSITORY=f"file://{shell.folder.parent / 'address'}", **variables)
         text = (shell.folder / f"{name}.html").read_text()
         for line in text.splitlines():
             if "goals reached" in line and "%" in line and "print" not in line:
                 print(f"    {name}: {line.strip()}")
-    shell.type("ls")
+    shell.run("ls")
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -110,10 +110,10 @@ def fetch_push(recording: Recording) -> list[Figure]:
     ]
 
 
-def play_push(env: Any, actions: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return observations [N, T + 1, 25] of FetchPush for actions [N, T, 4] and initial box positions ``places`` [N, 2] (m)."""
+def play_push(env: Any, actions: np.ndarray, box_positions: np.ndarray) -> np.ndarray:
+    """Return observations [N, T + 1, 25] of FetchPush for actions [N, T, 4] and initial ``box_positions`` [N, 2] (m)."""
     begin, see = push_programs(env)
-    state = jax.device_get(begin(places))
+    state = jax.device_get(begin(box_positions))
     observations = [see(state.data)]
     for time in range(actions.shape[1]):
         state = environments.advance(env, state, actions[:, time])

@@ -27,7 +27,16 @@ MAX_OBLIQUITY = 0.1  # standard deviation of the direction of a push from a face
 
 
 def sample_actions(rng: np.random.Generator, sequences: int, size: int, lower: float) -> np.ndarray:
-    """Sample actions [N, 50, ``size``] float32 in [-1, 1]."""
+    """Sample actions [``sequences``, 50, ``size``] float32 in [-1, 1].
+
+    Sequences alternate between independent uniform actions, uniform actions held for ten steps, and autoregressive actions.
+
+    Args:
+        rng: Source of the actions.
+        sequences: Number of sequences.
+        size: Size of an action.
+        lower: Value subtracted from the third component, so that the gripper tends downwards.
+    """
     actions = np.empty((sequences, STEPS, size))
     for number, sequence in enumerate(actions):
         if number % 3 == 0:
@@ -161,6 +170,11 @@ class Pusher:
 def record_pushes(rng: np.random.Generator, sequences: int, control: bool) -> dict[str, np.ndarray]:
     """Record N pushes of FetchPush's object.
 
+    Args:
+        rng: Source of starts and pushes.
+        sequences: N.
+        control: Whether the pusher passes over the object without touching it, as a control experiment.
+
     Returns:
         ``actions`` [N, T, 4]; ``observations`` [N, T + 1, 25] float32, rounded to 5 decimals; and ``touches`` [N, T + 1] bool,
         True if a finger touches the object.
@@ -203,7 +217,7 @@ RECORDERS = {
 
 
 def main() -> int:
-    """Write the recording."""
+    """Record the sequences, write them to the file, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env", choices=[*RECORDERS, "FetchPush"])
     parser.add_argument("file")

@@ -89,7 +89,12 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
 
 
 def describe_worst(mj_model: mujoco.MjModel, worst: tuple[float, int, int]) -> dict[str, Any]:
-    """Name the model and pose with the worst value of a measure."""
+    """Return number and name of the geom, and the index of the pose, with the worst value of a measure.
+
+    Args:
+        mj_model: The model.
+        worst: Value, number of the geom, and index of the pose.
+    """
     _, number, pose = worst
     return {"object": number, "name": mj_model.geom(number).name if 0 <= number < mj_model.ngeom else "", "pose": pose}
 
@@ -130,7 +135,7 @@ def read_rows(file: pathlib.Path) -> list[dict[str, Any]]:
 
 
 def main() -> int:
-    """Compare the named models, or all; return the exit status."""
+    """Compare the named models, or all; return the exit status: 1 if a bound is violated, else 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="*", metavar="MODEL", help="all if none is named; or the path of one folder of models")
     parser.add_argument("--poses", type=int, default=200)

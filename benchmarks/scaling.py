@@ -39,7 +39,7 @@ import numpy as np
 from jax.sharding import PartitionSpec
 
 from jaxrl_vis import preset
-from jaxrl_vis.bench.conditions import Watch
+from jaxrl_vis.bench.conditions import ConditionMonitor
 from jaxrl_vis.bench.record import Measurement, to_record, write_json
 from jaxrl_vis.config import Config
 from jaxrl_vis.host import distributed
@@ -113,9 +113,9 @@ class Timed:
     def compile(self) -> None:
         """Compile the programs, or load them from the compilation cache."""
         self.programs.compiled("init")
-        self.programs.of_training()
+        self.programs.training_programs()
         if self.evaluates:
-            self.programs.of_evaluation()
+            self.programs.evaluation_programs()
 
 
 def compile_all(everything: list[Timed]) -> float:
@@ -156,7 +156,7 @@ def all_reduce_seconds(numbers: int, devices: int) -> float:
 
 
 def words(tree: Any) -> dict[str, bytes]:
-    """Return the bytes of all leaves of a learner or a replay, by name."""
+    """Return the bytes of all leaves of a loop state, by name."""
     plain = {
         name: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
         for name, leaf in named_leaves(tree).items()
@@ -209,7 +209,7 @@ class Comparison:
 
 
 def make_comparisons(base: Config, env: Any, numbers: list[int], batches: tuple[int, ...], seeds: int) -> list[Comparison]:
-    """Create all configurations to be measured."""
+    """Create all configurations to be measured, for ``numbers`` of devices and ``seeds`` per device."""
     one_of = {batch: Timed(base.replace(batch_size=batch), env, False) for batch in batches}
     one_seeds, comparisons = Timed(base.replace(seeds=seeds), env, True), []
     for count in numbers:
@@ -305,16 +305,16 @@ def measure_as_process(timed: list[Timed], cycles: int) -> None:
     seconds = []
     for configuration in timed:
         configuration.compile()
-        distributed.meet("compiled")
+        distributed.sync_processes("compiled")
         seconds.append(configuration.run(cycles))
         configuration.loop = None
     print(json.dumps(seconds), flush=True)
 
 
-def write_records(file: Path | None, watch: Watch, measurements: list[Measurement]) -> None:
+def write_records(file: Path | None, monitor: ConditionMonitor, measurements: list[Measurement]) -> None:
     """Write all measurements so far, if a file is given."""
     if file is not None:
-        conditions = watch.conditions()
+        conditions = monitor.conditions()
         write_json(file, [to_record(measurement, conditions) for measurement in measurements])
         print(f"records: {file}", flush=True)
 
@@ -361,7 +361,7 @@ def main() -> None:
     if options.positions is not None:
         measure_as_process([everything[position] for position in options.positions], options.cycles)
         return
-    watch = Watch()
+    monitor = ConditionMonitor()
     lines, measurements, times = [], [], {}
 
     def keep(line: str, measurement: Measurement | None = None) -> None:
@@ -390,7 +390,7 @@ def main() -> None:
                 keep(line)
             pair.reference.loop = None
         pair.timed.loop = None
-    write_records(options.json, watch, measurements)
+    write_records(options.json, monitor, measurements)
     if numbers[-1] % 2 == 0:
         again = [
             pair for pair in comparisons if pair.timed.config.run.devices == numbers[-1] and pair.kind in ("seeds", "weak")
@@ -405,7 +405,7 @@ def main() -> None:
         f"{jax.devices()[0].device_kind}, JAX {jax.__version__}, {took:.0f} s\n"
     )
     print("\n".join(lines))
-    write_records(options.json, watch, measurements)
+    write_records(options.json, monitor, measurements)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,15 @@ MAX_BYTES = 2 * 1024**2
 
 
 def fresh_score(run_dir: Path, checkpoint: Choice, seed: int, iteration: int, episodes: int) -> Score:
-    """Evaluate one seed of a run, or a policy alone, on fresh episodes."""
+    """Evaluate one seed of a run, or a policy alone, on fresh episodes.
+
+    Args:
+        run_dir: Run folder, or folder of a policy.
+        checkpoint: Checkpoint of the run; None for the newest, or for a policy.
+        seed: Seed of the learner within the run.
+        iteration: Iteration of the checkpoint, for the environment steps in the score.
+        episodes: Number of episodes.
+    """
     trainer = open_run(run_dir, cache_programs=True, eval_episodes=episodes)
     metrics = trainer.evaluate(load(trainer, run_dir, checkpoint).train, jax.random.key(FRESH_KEY))
     row = {name: float(values[trainer.seeds.index(seed)]) for name, values in metrics.items()}
@@ -37,7 +45,14 @@ def fresh_score(run_dir: Path, checkpoint: Choice, seed: int, iteration: int, ep
 
 
 def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None = None, episodes: int = 256) -> Score:
-    """Write the folder of a policy; return its score.
+    """Write the folder of a policy in the package; return the score of the shipped weights on fresh episodes.
+
+    Args:
+        run_dir: Run folder.
+        name: Name of the policy's folder.
+        checkpoint: Checkpoint to ship; None for that of `load_policy`.
+        seed: Seed to ship; None for that of `load_policy`.
+        episodes: Number of fresh episodes.
 
     Raises:
         RequestError: The run cannot be used, or its policy is too large.
@@ -67,7 +82,7 @@ def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None =
             policy.seed,
             {policy.seed: score_float16},
             policy.env.distance_unit,
-            name_here=name,
+            shipped_name=name,
             remark=remark,
         )
         write_atomically(folder / "README.md", text)

@@ -1,7 +1,7 @@
 """Add trained weights to the package, quantised to 10 bits: `python benchmarks/ship_weights.py FILE`.
 
-FILE is the segmentation network written by `jaxrl-vis phenotype train` or `jaxrl-vis grasp train`. With 16 bits the wheel would
-become too large.
+FILE holds the networks written by `jaxrl-vis phenotype train` or `jaxrl-vis grasp train`. With 16 bits the wheel would become
+too large.
 """
 
 import sys
@@ -14,7 +14,7 @@ from jaxrl_vis.stalks.phenotyping.detector import weights
 
 
 def main(trained: Path) -> None:
-    """Replace the packaged network whose architecture the trained weights match; exit with an error line if there is none."""
+    """Replace the packaged weights of the networks in the file ``trained``; exit with an error line if it contains none."""
     for room in (weights, painter):
         try:
             params, settings, origin = room.read_weights(trained)

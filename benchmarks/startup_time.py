@@ -38,7 +38,7 @@ class Clock:
         self._wall, self._processor = float(os.environ.get(STARTED, time.time())), 0.0
 
     def lap(self, name: str) -> None:
-        """End a lap and start the next."""
+        """End a lap, store its wall-clock and processor time (s) under ``name``, and start the next."""
         wall, processor = time.time(), time.process_time()
         self.laps[name] = round(wall - self._wall, 3), round(processor - self._processor, 3)
         self._wall, self._processor = time.time(), time.process_time()
@@ -87,8 +87,20 @@ def start(clock: Clock, options: argparse.Namespace) -> None:
 MODES = ("cold", "warm")
 
 
-def time_modes(mode: str, cache: str, options: argparse.Namespace) -> dict[str, tuple[float, float]]:
-    """Measure in a new process; return its laps."""
+def time_mode(mode: str, cache: str, options: argparse.Namespace) -> dict[str, tuple[float, float]]:
+    """Measure one mode in a new process.
+
+    Args:
+        mode: One of the values of ``--mode``.
+        cache: Folder of the compilation cache.
+        options: Options of the command line: ``env``, ``seeds`` and ``preset``.
+
+    Returns:
+        Wall-clock and processor time of each lap, s, by name.
+
+    Raises:
+        subprocess.CalledProcessError: The process failed.
+    """
     command = [sys.executable, __file__, options.env, "--seeds", str(options.seeds), "--mode", mode]
     command += ["--preset", options.preset] if options.preset else []
     variables = {
@@ -101,7 +113,7 @@ def time_modes(mode: str, cache: str, options: argparse.Namespace) -> dict[str, 
     return {name: tuple(seconds) for name, seconds in json.loads(output.splitlines()[-1]).items()}
 
 
-def show(mode: str, laps: dict[str, tuple[float, float]]) -> None:
+def print_laps(mode: str, laps: dict[str, tuple[float, float]]) -> None:
     """Print the table of a process."""
     print(f"{mode:32}{'wall-clock s':>14}{'processor s':>14}")
     total = [sum(seconds) for seconds in zip(*laps.values(), strict=True)]
@@ -126,8 +138,8 @@ def main() -> None:
     laps = {}
     with tempfile.TemporaryDirectory() as cache:
         for mode in MODES:
-            laps[mode] = time_modes(mode, cache, options)
-            show(mode, laps[mode])
+            laps[mode] = time_mode(mode, cache, options)
+            print_laps(mode, laps[mode])
     if options.json:
         options.json.write_text(json.dumps(laps, indent=1) + "\n", encoding="utf-8")
 

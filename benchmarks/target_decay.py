@@ -14,7 +14,7 @@ from benchmarks.ledger.markers import WIDTH
 from benchmarks.ledger.records import RESULTS
 from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.report.learning import curve, steps_to
-from jaxrl_vis.report.plots import show_steps
+from jaxrl_vis.report.plots import format_steps
 from jaxrl_vis.run.storage.folder import read_record
 from jaxrl_vis.run.storage.metrics import read_rows
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
@@ -64,7 +64,13 @@ class Group:
 
 
 def read_groups(studies: Path) -> dict[tuple[str, str, float], Group]:
-    """Read the runs by task, variant and decay; if a decay has no fresh seeds, use those of figure 5.4 (seeds 0 to 4)."""
+    """Read the runs by task, variant and decay.
+
+    For `RELEASED_DECAY` without runs of its own, use those of figure 5.4 (seeds 0 to 4).
+
+    Args:
+        studies: Folder with the subfolders ``target_decay`` and ``ol_aux``.
+    """
     folders = collections.defaultdict(list)
     for folder in sorted((studies / "target_decay").iterdir()):
         task, variant, decay = re.fullmatch(r"(.+)-(\w+)-paper-decay([\d.]+)-seeds\d+to\d+", folder.name).groups()
@@ -85,18 +91,18 @@ def _read_group(decay: float, folders: list[Path]) -> Group:
 
 
 def steps_cell(group: Group, level: float) -> str:
-    """Format the environment steps to a level, or the budget within which it was not reached."""
+    """Format the environment steps until the median success reaches a level, or ``> STEPS`` of the last evaluation if never."""
     steps = steps_to(group.points, level)
-    return f"> {show_steps(group.points[-1][0])}" if steps is None else show_steps(steps)
+    return f"> {format_steps(group.points[-1][0])}" if steps is None else format_steps(steps)
 
 
 def task_table(task: str, groups: dict[tuple[str, str, float], Group]) -> list[str]:
-    """Write the table of a task, one row per variant and decay."""
+    """Return the lines of a task's Markdown table, one row per variant and decay (descending)."""
     title, levels, budget = TASKS[task]
     theirs = released_curves()
     lines = [
         f"| {title} | decay | seeds | {' | '.join(f'steps to {level:g}' for level in levels)} | mean success to "
-        f"{show_steps(budget)}, IQM (95 %) | distance to the authors' curve |",
+        f"{format_steps(budget)}, IQM (95 %) | distance to the authors' curve |",
         "|---|---|---|" + "---|" * len(levels) + "---|---|",
     ]
     for variant, label in VARIANTS.items():
@@ -115,7 +121,7 @@ def task_table(task: str, groups: dict[tuple[str, str, float], Group]) -> list[s
 
 
 def comparison_table(groups: dict[tuple[str, str, float], Group]) -> list[str]:
-    """Write the table of OL-AUX-5's gain at every decay: means, and the p-value of an exact permutation test."""
+    """Return the lines of the Markdown table of OL-AUX-5's gain at every decay: means, and p-value of a permutation test."""
     lines = ["| task | decay | without | OL-AUX-5 | seeds | p |", "|---|---|---|---|---|---|"]
     for task, (title, _, budget) in TASKS.items():
         for decay in sorted({key[2] for key in groups if key[0] == task}, reverse=True):
@@ -132,7 +138,7 @@ def comparison_table(groups: dict[tuple[str, str, float], Group]) -> list[str]:
 
 
 def tables(results: Path = RESULTS) -> str:
-    """Write all tables of the page, as Markdown."""
+    """Return all tables of the page as Markdown, followed by the runs' revisions and devices."""
     groups = read_groups(results / "studies")
     parts = [line for task in TASKS for line in [*task_table(task, groups), ""]]
     revisions = sorted({text for group in groups.values() for text in group.revisions})

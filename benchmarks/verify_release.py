@@ -50,7 +50,11 @@ def commit_time(checkout: Path) -> int:
 
 
 def export(checkout: Path, folder: Path) -> None:
-    """Write the files of the last commit into a new folder, so that a release has committed files only."""
+    """Write the files of the last commit into a folder, created if necessary, so that a release has committed files only.
+
+    Raises:
+        subprocess.CalledProcessError: git failed.
+    """
     folder.mkdir(parents=True)
     archive = folder.with_suffix(".tar")
     subprocess.run(["git", "-C", str(checkout), "archive", "--output", str(archive), "HEAD"], check=True)
@@ -66,6 +70,9 @@ def build(source: Path, out: Path, seconds: int) -> list[Path]:
         source: The sources.
         out: Folder of the files.
         seconds: Modification time of all their members, s since 1970.
+
+    Raises:
+        RuntimeError: The build failed; the message contains its output.
     """
     command = [sys.executable, "-m", "build", "--wheel", "--sdist", "--no-isolation", "--outdir", str(out), str(source)]
     done = subprocess.run(command, env=os.environ | {"SOURCE_DATE_EPOCH": str(seconds)}, capture_output=True, text=True)
@@ -75,7 +82,7 @@ def build(source: Path, out: Path, seconds: int) -> list[Path]:
 
 
 def members(archive: Path) -> dict[str, tuple[Any, ...]]:
-    """Return size, time, mode and digest of each file in a wheel or an sdist, by name."""
+    """Return size (bytes), modification time, mode and SHA-256 digest of each file in a wheel or an sdist, by name."""
     if archive.suffix == ".whl":
         with zipfile.ZipFile(archive) as files:
             return {
@@ -107,12 +114,15 @@ def differences(first: Path, second: Path) -> Iterator[str]:
 
 
 def bill_of_materials(python: Path, checkout: Path, path: Path) -> None:
-    """Write the bill of materials of an environment, without local paths.
+    """Write the bill of materials (CycloneDX, JSON) of an environment, without local paths, pip, setuptools and this package.
 
     Args:
         python: The environment's interpreter.
         checkout: Checkout with pyproject.toml, which describes the root component.
         path: The file.
+
+    Raises:
+        subprocess.CalledProcessError: ``cyclonedx_py`` failed or is not installed.
     """
     command = [sys.executable, "-m", "cyclonedx_py", "environment", str(python)]
     command += ["--pyproject", str(checkout / "pyproject.toml"), "--output-reproducible"]
@@ -131,22 +141,22 @@ def bill_of_materials(python: Path, checkout: Path, path: Path) -> None:
 
 
 def first_example(page: Path) -> str:
-    """Return the first Python block of a page."""
+    """Return the first Python block of a Markdown page, without its fences; "" if it has none."""
     return page.read_text().partition("```python\n")[2].partition("```")[0]
 
 
 def smoke_test(shell: Shell, wheel: Path) -> None:
-    """Install a wheel into a new environment, and run the commands of `SMOKE`."""
+    """Install a wheel into a new environment, and run the commands of `SMOKE`; failures are added to ``shell.failures``."""
     (shell.folder / "ten_lines.py").write_text(first_example(CHECKOUT / "docs" / "weighting.md"))
-    shell.type("python3 -m venv venv")
+    shell.run("python3 -m venv venv")
     shell.activate(shell.folder / "venv")
-    shell.type(f"pip install --quiet {wheel}")
+    shell.run(f"pip install --quiet {wheel}")
     for words, shows in SMOKE:
-        shell.type(words, shows=shows)
+        shell.run(words, shows=shows)
 
 
 def main() -> int:
-    """Run the command line; return the exit status."""
+    """Build, compare and test a release; return 1 if anything differs or fails, else 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=CHECKOUT / "dist", help="folder of the release")
     parser.add_argument("--python", default=sys.executable, help="interpreter of the empty environment")

@@ -98,8 +98,11 @@ def problems() -> dict[str, Problem]:
     }
 
 
-def initialize(key: jax.Array, problem: Problem) -> Any:
-    """Initialise the parameters: a trunk of two layers and a linear head for each task."""
+def init_params(key: jax.Array, problem: Problem) -> Any:
+    """Initialise the parameters: a trunk of two layers ([pixels, 64], [64, WIDTH]) and a linear head [WIDTH, classes] per task.
+
+    Biases are omitted; weights are normal with variance 1 / inputs.
+    """
 
     def layer(key: jax.Array, rows: int, columns: int) -> jax.Array:
         return jax.random.normal(key, (rows, columns)) / np.sqrt(rows)
@@ -118,7 +121,7 @@ def logits(params: Any, x: jax.Array) -> dict[str, jax.Array]:
 
 
 def losses(params: Any, batch: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """Return the mean cross-entropy of each task."""
+    """Return the mean cross-entropy [] of each task over a batch: ``x`` [N, pixels] and labels [N] int by task."""
     outputs = logits(params, batch["x"])
     return {
         name: jnp.mean(optax.softmax_cross_entropy_with_integer_labels(values, batch[name])) for name, values in outputs.items()
@@ -126,7 +129,10 @@ def losses(params: Any, batch: dict[str, jax.Array]) -> dict[str, jax.Array]:
 
 
 def make_training(problem: Problem, weighting: jw.Weighting) -> Callable[[jax.Array, jax.Array], dict[str, jax.Array]]:
-    """Return the jitted training of R parallel runs: (rates [R], seeds [R]) -> accuracies [R] on each split except train."""
+    """Return the jitted training of R parallel runs: (rates [R], seeds [R]) -> accuracies [R] on ``valid`` and ``test``.
+
+    The accuracy is the mean over the scored tasks, after `STEPS` steps of Adam.
+    """
     gradient = jw.weighted_grad(losses, weighting, shared=lambda params: params["trunk"])
     optimizer = optax.scale_by_adam()
     known = {name: jnp.asarray(values) for name, values in problem.splits["train"].items()}
@@ -137,7 +143,7 @@ def make_training(problem: Problem, weighting: jw.Weighting) -> Callable[[jax.Ar
 
     def run(rate: jax.Array, seed: jax.Array) -> dict[str, jax.Array]:
         params_key, state_key, data_key = jax.random.split(jax.random.key(seed), 3)
-        params = initialize(params_key, problem)
+        params = init_params(params_key, problem)
         state = weighting.init(tuple(problem.classes), params["trunk"], *([params] if weighting.hold else []))
         state = state if state.key is None else state.replace(key=state_key)
 
@@ -157,7 +163,12 @@ def make_training(problem: Problem, weighting: jw.Weighting) -> Callable[[jax.Ar
 
 
 def measure(problem: Problem, name: str) -> dict[str, Any]:
-    """Tune and test one method; return its rate, its validation accuracy at each rate, and its test accuracies."""
+    """Tune and test one method.
+
+    Returns:
+        ``method``, the best ``rate``, ``valid`` (mean validation accuracy at each of `RATES`), ``test`` (test accuracy of each
+        test seed at the best rate) and ``seconds`` of the test runs.
+    """
     train = make_training(problem, jw.make_weighting(name))
     rates = [jnp.full(len(TUNING_SEEDS), rate) for rate in RATES]
     valid = [float(jnp.mean(train(rate, jnp.array(TUNING_SEEDS))["valid"])) for rate in rates]
@@ -173,13 +184,13 @@ def measure(problem: Problem, name: str) -> dict[str, Any]:
     }
 
 
-def methods(problem: Problem) -> Iterator[str]:
-    """Yield the weightings applicable to a problem, the baseline first; those with a main loss need a main task."""
+def applicable_weightings(problem: Problem) -> Iterator[str]:
+    """Yield the names of the weightings applicable to a problem, the baseline first; some require a main task."""
     for name in (BASELINE, *(name for name in jw.WEIGHTINGS if name != BASELINE)):
         weighting = jw.make_weighting(name)
         if jw.MAIN not in problem.classes:
             try:
-                weighting.init(tuple(problem.classes), initialize(jax.random.key(0), problem)["trunk"])
+                weighting.init(tuple(problem.classes), init_params(jax.random.key(0), problem)["trunk"])
             except RequestError:
                 continue
         yield name
@@ -194,7 +205,7 @@ def main() -> int:
     record: dict[str, Any] = json.loads(options.json.read_text()) if options.json.exists() else {"problems": {}}
     for title, problem in problems().items():
         rows = record["problems"].setdefault(title, [])
-        for name in methods(problem):
+        for name in applicable_weightings(problem):
             if any(row["method"] == name for row in rows) or (options.only and name not in options.only):
                 continue
             rows.append(measure(problem, name))

@@ -39,7 +39,7 @@ from jaxrl_vis_envs.goals import indicator_reward as rewards
 
 __all__ = ["Learner", "goal_slots", "keep_mask", "learn", "rewards"]
 
-_INSERT, _UPDATE = 0x696E73, 0x757064  # folded into the seed's key
+_CALL, _UPDATE = 0x696E73, 0x757064  # folded into the seed's key
 # Metrics that compare rewards with true states, which are unknown here.
 _NEED_TRUTH = ("false_", "filtered_false")
 
@@ -107,15 +107,15 @@ class Learner:
             )
         shape = observation_shape if len(observation_shape) == 1 else (observation_shape[2], *observation_shape[:2])
         self._spec = jax.ShapeDtypeStruct(shape, jnp.uint8 if len(shape) == 3 else jnp.float32)
-        self._given_shape, self._action_size, self._horizon = tuple(observation_shape), action_size, horizon
+        self._observation_shape, self._action_size, self._horizon = tuple(observation_shape), action_size, horizon
         self._state_size = state_size
         auxiliary = make_auxiliary(self.config, self._spec, action_size, 1, compute_dtype(self.config))
         if auxiliary.tasks:
             raise RequestError("a learner on the host has no auxiliary losses: leave out aux_tasks")
         setup = Setup(self.config, resolved, self._spec, action_size, auxiliary)
-        wanted = self.config.run.algorithm
-        maker = find("algorithm", wanted, train_step.ALGORITHMS, self.config.environment.env_folder)
-        self._algorithm = call("algorithm", wanted, maker, setup, of=Algorithm)
+        algorithm = self.config.run.algorithm
+        maker = find("algorithm", algorithm, train_step.ALGORITHMS, self.config.environment.env_folder)
+        self._algorithm = call("algorithm", algorithm, maker, setup, of=Algorithm)
         self._replay = Replay(capacity, 1, horizon)
         self._sampler = Sampler(self.config, resolved, self._replay, threshold)
         self._key = jax.random.key(self.config.run.seed)
@@ -124,11 +124,11 @@ class Learner:
         self._updates: dict[int, Callable[..., Any]] = {}
         self.episodes, self._calls = 0, 0
 
-    def _checked(self, name: str, array: Any, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    def _check_array(self, name: str, array: Any, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         array = np.asarray(array)
         if array.shape != shape or (dtype == np.uint8) != (array.dtype == np.uint8) or not np.all(np.isfinite(array)):
-            wanted = "uint8" if dtype == np.uint8 else "finite numbers"
-            raise RequestError(f"{name} must be {wanted} of the shape {shape}, not {array.dtype} of {array.shape}")
+            expected = "uint8" if dtype == np.uint8 else "finite numbers"
+            raise RequestError(f"{name} must be {expected} of the shape {shape}, not {array.dtype} of {array.shape}")
         return array.astype(dtype)
 
     def add(self, observations: Any, actions: Any, goal: Any = None, states: Any = None) -> None:
@@ -142,19 +142,19 @@ class Learner:
                 ``state_size``.
 
         Raises:
-            RequestError: A shape or dtype is wrong, or a value is not finite.
+            RequestError: A shape or dtype is wrong, a value is not finite, or ``states`` are missing or superfluous.
         """
         if (states is None) != (self._state_size == 0):
             raise RequestError("states are needed where a learner has a state_size, and only there")
         dtype = np.dtype(self._spec.dtype)
-        seen = self._checked("observations", observations, (self._horizon + 1, *self._given_shape), dtype)
-        done = self._checked("actions", actions, (self._horizon, self._action_size), np.dtype(np.float32))
-        aim = seen[-1] if goal is None else self._checked("goal", goal, self._given_shape, dtype)
+        seen = self._check_array("observations", observations, (self._horizon + 1, *self._observation_shape), dtype)
+        done = self._check_array("actions", actions, (self._horizon, self._action_size), np.dtype(np.float32))
+        aim = seen[-1] if goal is None else self._check_array("goal", goal, self._observation_shape, dtype)
         true = np.zeros((self._horizon + 2, 1)) if states is None else states
         shape = (self._horizon + 2, max(1, self._state_size))
         episode = Episodes(
             observations=_planar(np.concatenate([seen, aim[None]]))[None],  # type: ignore[arg-type]
-            states=self._checked("states", true, shape, np.dtype(np.float32))[None],  # type: ignore[arg-type]
+            states=self._check_array("states", true, shape, np.dtype(np.float32))[None],  # type: ignore[arg-type]
             actions=np.clip(done, -1.0, 1.0)[None],  # type: ignore[arg-type]
         )
         self._state, self._train = self._insert(self._state, self._train, episode, self.episodes)
@@ -186,7 +186,7 @@ class Learner:
             agent, metrics = self._algorithm.update(train.agent, train.statistics, batches, jax.random.fold_in(key, _UPDATE))
             return train.replace(agent=agent), metrics
 
-        key = jax.random.fold_in(jax.random.fold_in(self._key, _INSERT), self._calls)
+        key = jax.random.fold_in(jax.random.fold_in(self._key, _CALL), self._calls)
         compiled = self._updates.setdefault(count, jax.jit(update, donate_argnums=0))
         self._train, metrics = compiled(self._train, self._state, key, self.episodes - 1)
         self._calls += 1
@@ -201,7 +201,9 @@ class Learner:
             RequestError: A shape or dtype is wrong, or a value is not finite.
         """
         dtype = np.dtype(self._spec.dtype)
-        seen, aim = (self._checked(*each, self._given_shape, dtype) for each in (("observation", observation), ("goal", goal)))
+        seen, aim = (
+            self._check_array(*pair, self._observation_shape, dtype) for pair in (("observation", observation), ("goal", goal))
+        )
         return np.asarray(self._act(self._train, _planar(seen)[None], _planar(aim)[None])[0])
 
     @functools.cached_property

@@ -1,4 +1,4 @@
-"""Trains a robot from Python: the command line does no more than this.
+"""Train a robot from Python, as the command line does.
 
     python notebooks/train.py                            a small run for two laptop cores
     python notebooks/train.py fast VisualFetchReach      preset and environment

@@ -22,6 +22,7 @@ os.environ["JAXRL_VIS_KEEP_PROGRAMS"] = "0"
 # Where each operation was called from, all the way up, is a twentieth of what there is to compile.
 os.environ.setdefault("JAX_INCLUDE_FULL_TRACEBACKS_IN_LOCATIONS", "0")
 # Programs of tests run for a moment: optimising their machine code takes longer. What XLA makes of them before is the same.
+# Three passes that improve loops take an eighth of the rest, and change no result.
 # Both cores are busy with tests, so a program is not split into parts that could be compiled side by side either.
 # Fusion emitters take as long to compile as all the rest, and programs of environments do without them anyway, see
 # `compilation.compiler_options`. JAX 0.11 does not know the option any more, and would end the process.
@@ -30,6 +31,7 @@ os.environ["XLA_FLAGS"] = " ".join(
         os.environ.get("XLA_FLAGS", ""),
         "--xla_backend_optimization_level=0",
         "--xla_cpu_parallel_codegen_split_count=1",
+        "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,apply-xla-transforms",
         *(["--xla_cpu_use_fusion_emitters=false"] if version("jaxlib").startswith("0.10.") else []),
     )
 )

@@ -22,7 +22,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import Terminated
 from jaxrl_vis.learner.acting.evaluate import Evaluation
 from jaxrl_vis.learner.acting.rollout import Exploration
-from jaxrl_vis.learner.acting.rollout_parts import played_spec
+from jaxrl_vis.learner.acting.rollout_parts import part_result_spec
 from jaxrl_vis.learner.iteration import Learned
 from jaxrl_vis.learner.memory.replay import make_replay
 from jaxrl_vis.learner.parallel.sharding import ONE_DEVICE
@@ -80,8 +80,8 @@ class FakeProgram:
     def __init__(self, config: Config, nan_at: int | None = None, break_state: bool = False, filtered_share: float = 0.1):
         size, num_envs = config.environment.image_size, config.run.num_envs
         self.config, self.layout, self.env = config, ONE_DEVICE, _make_env(size)
-        self.plays_any, self.part_size, self.exploration = False, num_envs, Exploration()
-        self.parts_spec = [played_spec(self.env, num_envs, config.run.seeds)]
+        self.plays_parts, self.part_size, self.exploration = False, num_envs, Exploration()
+        self.parts_spec = [part_result_spec(self.env, num_envs, config.run.seeds)]
         self.steps_per_iteration = num_envs * HORIZON
         self.updates_per_iteration = 3
         self.num_iterations = math.ceil(config.run.env_steps / self.steps_per_iteration)
@@ -101,7 +101,7 @@ class FakeProgram:
 def _jitted(sizes: _Sizes) -> dict[str, Any]:
     """Make `init`, `keys`, `play`, `learn` and `evaluate`."""
     size, episodes = sizes.image, sizes.episodes
-    played = played_spec(_make_env(size), sizes.num_envs, sizes.seeds)
+    played = part_result_spec(_make_env(size), sizes.num_envs, sizes.seeds)
 
     def init_one(key):
         parameters = {"layer": {"kernel": jax.random.uniform(key, (4, 3)) - 0.5, "bias": jnp.zeros(3)}}

@@ -62,7 +62,7 @@ def _recognised(path: Path) -> None:
     from jaxrl_vis.stalks.phenotyping.io.calibrations import kitti, middlebury, ros, zed
 
     text = documents.read_text(path, 2_000_000)
-    known = (middlebury.is_middlebury, kitti.is_kitti, zed.is_settings, ros.from_print, ros.from_table, ros.from_sections)
+    known = (middlebury.is_middlebury, kitti.is_kitti, zed.is_settings, ros.parse_printed, ros.parse_csv, ros.parse_ini)
     if not any(recognise(text) for recognise in known):
         _storage(path)
 
@@ -75,9 +75,9 @@ def read_plan(folder: Path) -> None:
 
 
 def _plan(path: Path) -> None:
-    from jaxrl_vis.stalks.phenotyping.io.tables.cells import cells, read_table_text
+    from jaxrl_vis.stalks.phenotyping.io.tables.cells import read_table_text, split_cells
 
-    assert cells(path, read_table_text(path, 1_000_000))[1]
+    assert split_cells(path, read_table_text(path, 1_000_000))[1]
 
 
 def read_any_annotations(folder: Path) -> None:
@@ -142,19 +142,19 @@ def _table(path: Path) -> None:
 
 def read_image(folder: Path) -> None:
     from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles
-    from jaxrl_vis.stalks.phenotyping.io.images import rgb8
-    from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, read_pair, read_side
+    from jaxrl_vis.stalks.phenotyping.io.images import to_rgb8
+    from jaxrl_vis.stalks.phenotyping.io.pair_reading import UnusablePairError, read_pair, read_side
     from jaxrl_vis_envs.plants import Calibration
 
     sides = sorted(folder.iterdir())
     pair = PairFiles("a", sides[0], sides[-1] if sides[-1].stat().st_size else None)
     try:
         left, right = read_pair(pair, Calibration(IMAGE[1], IMAGE[0], 20.0, (10.0, 6.0), 0.1))
-    except Unusable as error:
+    except UnusablePairError as error:
         if "black" not in str(error):
             raise
         left = right = read_side(pair, "left")
-    assert left.shape == right.shape == (*IMAGE, 3) and left.dtype == np.uint8 and (rgb8(left) == left).all()
+    assert left.shape == right.shape == (*IMAGE, 3) and left.dtype == np.uint8 and (to_rgb8(left) == left).all()
 
 
 def read_names(folder: Path) -> None:
@@ -174,9 +174,9 @@ def read_names(folder: Path) -> None:
 
 def read_disparity(folder: Path) -> None:
     from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles
-    from jaxrl_vis.stalks.phenotyping.io.pair_reading import known_disparity
+    from jaxrl_vis.stalks.phenotyping.io.pair_reading import read_known_disparity
 
-    found = known_disparity(PairFiles("a", None, None, _only(folder)), np.zeros((*IMAGE, 3), np.uint8), 64.0)
+    found = read_known_disparity(PairFiles("a", None, None, _only(folder)), np.zeros((*IMAGE, 3), np.uint8), 64.0)
     assert found is not None and found.shape == IMAGE and found.dtype == np.float32
     assert (np.isnan(found) | ((found > 0) & np.isfinite(found))).all()
 
@@ -239,12 +239,12 @@ def read_truth(folder: Path) -> None:
 def read_records(folder: Path) -> None:
     """What `phenotype run` kept of a pair: as good as new, or computed again."""
     from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles
-    from jaxrl_vis.stalks.phenotyping.pipeline import _is_whole, _sources
+    from jaxrl_vis.stalks.phenotyping.pipeline import _is_complete, _sources
     from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
     from jaxrl_vis.stalks.results_folder import is_current
 
     path = _only(folder)
-    if is_current(path, _sources(PairFiles("0", None, None), None), _is_whole):
+    if is_current(path, _sources(PairFiles("0", None, None), None), _is_complete):
         record = json.loads(path.read_bytes())
         assert all(len(Sighting.read(each).box) == 4 for each in record["sightings"])
 
@@ -278,9 +278,9 @@ def _loads(path: Path) -> None:
 
 
 def _pair_errors() -> tuple[type[Exception], ...]:
-    from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable
+    from jaxrl_vis.stalks.phenotyping.io.pair_reading import UnusablePairError
 
-    return (Unusable,)
+    return (UnusablePairError,)
 
 
 _REQUEST = (RequestError,)

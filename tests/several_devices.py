@@ -87,7 +87,7 @@ def trained(config, layout=None, iterations=3):
     for _ in range(iterations):
         loop, metrics = train_iteration(program, loop)
         found.append(jax.device_get(metrics))
-    key = program.layout.put(jax.random.key(9), program.layout.everywhere)
+    key = program.layout.put(jax.random.key(9), program.layout.replicated)
     return program, loop, [*found, jax.device_get(program.evaluate(loop.train, key)[0])]
 
 

@@ -11,7 +11,7 @@ _K = 1_000
 
 
 def _at(*thousands: float) -> list[c.Column]:
-    return [c.at(round(count * _K)) for count in thousands]
+    return [c.median_at(round(count * _K)) for count in thousands]
 
 
 def _rows(labels: Sequence[tuple[str, str]]) -> list[Row]:
@@ -53,7 +53,7 @@ def _fetch_100() -> str:
 
 def _reacher() -> str:
     rows = [Row("`fast`", learning("reacher_oracle")), Row("one encoder", ablation("reacher_oracle_shared"))]
-    distance = c.at(80 * _K, 3, DISTANCE, "distance in m at 80 k")
+    distance = c.median_at(80 * _K, 3, DISTANCE, "distance in m at 80 k")
     return table(["VisualReacher, 100x100"], rows, [c.seeds(), distance, c.names()])
 
 
@@ -136,7 +136,7 @@ def _cpu() -> str:
         Row("16 environments, one encoder, `--random-shift 1`", None),
         Row("the same with `--balance-probability 0.3 --relabel-probability 0.8`: `cpu`", seeds),
     ]
-    return table(["VisualFetchReach, preset `cpu`"], rows, [c.of_seeds(round(count * _K)) for count in (12.8, 19.2, 25.6)])
+    return table(["VisualFetchReach, preset `cpu`"], rows, [c.values_at(round(count * _K)) for count in (12.8, 19.2, 25.6)])
 
 
 def _finger() -> str:
@@ -220,7 +220,14 @@ def _fetch_fast() -> str:
         ),
     ]
     end = 25 * _K
-    columns = [c.seeds(), *_at(7.5, 10, 12.5, 15), c.steps_to(0.97), c.mean_success(end), c.p(base, "without", end), c.names()]
+    columns = [
+        c.seeds(),
+        *_at(7.5, 10, 12.5, 15),
+        c.steps_to(0.97),
+        c.mean_success(end),
+        c.p_value_against(base, "without", end),
+        c.names(),
+    ]
     return table(["VisualFetchReach, `fast`"], rows, columns)
 
 
@@ -241,7 +248,7 @@ def _fast(task: str, prefix: str, step: float, last: int) -> str:
     columns = [
         *_at(*(step * count for count in range(1, last + 1))),
         c.mean_success(end),
-        c.p(best, "OL-AUX-5", end),
+        c.p_value_against(best, "OL-AUX-5", end),
         c.names(),
     ]
     return table([f"{task}, `fast`, seeds 0 to 4"], rows, columns)
@@ -289,7 +296,7 @@ def _options() -> str:
     ]
     budgets = {record: budget for _, _, record, budget in settings}
     rows = [
-        Row(f"{task}, to {c.show_steps(budget)}" if task else "", record, [setting])
+        Row(f"{task}, to {c.format_steps(budget)}" if task else "", record, [setting])
         for task, setting, record, budget in settings
     ]
     mean = c.Column("mean success, IQM (95 %)", lambda record: c.interval(record.means(budgets[record])))

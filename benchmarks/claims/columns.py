@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.claims.records import DISTANCE, SUCCESS, Record
-from jaxrl_vis.report.plots import show_steps
+from jaxrl_vis.report.plots import format_steps
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
 from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
 
@@ -25,13 +25,13 @@ class Column(NamedTuple):
 
 
 def band(values: np.ndarray, digits: int = 3) -> str:
-    """Format median and quartiles, ``0.665 (0.635 to 0.685)``; only the median if all three round to the same."""
+    """Format median and quartiles of values [N], ``0.665 (0.635 to 0.685)``; only the median if all three round to the same."""
     low, median, high = (f"{value:.{digits}f}" for value in np.percentile(values, [25, 50, 75]))
     return median if low == median == high else f"{median} ({low} to {high})"
 
 
 def interval(values: np.ndarray, digits: int = 3) -> str:
-    """Format the interquartile mean and its 95 % bootstrap interval."""
+    """Format the interquartile mean of values [N] and its 95 % bootstrap interval."""
     low, high = bootstrap_interval([values])
     return f"{interquartile_mean([values]):.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
@@ -48,7 +48,13 @@ def show_p(value: float) -> str:
 
 
 def verdict(record: Record, reference: Record, budget: int | None = None) -> str:
-    """Return ``better`` or ``worse`` if the permutation test is significant, else ``level``."""
+    """Return ``better`` or ``worse`` if a record's mean success differs significantly from a reference's, else ``level``.
+
+    Args:
+        record: The record.
+        reference: Record to compare with.
+        budget: Environment steps up to which success is averaged; None for all.
+    """
     if p_value(record, reference, budget) > SIGNIFICANT:
         return "level"
     return "better" if record.means(budget).mean() > reference.means(budget).mean() else "worse"
@@ -65,9 +71,9 @@ def speed_up(record: Record, reference: Record, level: float) -> str:
 
 
 def steps_cell(record: Record, level: float) -> str:
-    """Format the environment steps to a level, or the budget within which it was not reached."""
+    """Format the environment steps until the median success reaches a level, or ``> STEPS`` of the last evaluation if never."""
     steps = record.steps_to(level)
-    return f"> {show_steps(record.points[-1][0])}" if steps is None else show_steps(steps)
+    return f"> {format_steps(record.points[-1][0])}" if steps is None else format_steps(steps)
 
 
 def _source(record: Record) -> str:
@@ -76,7 +82,7 @@ def _source(record: Record) -> str:
 
 @functools.cache
 def authors(task: str, variant: str, budget: int) -> Record:
-    """Return the authors' released curve up to a budget, as a record of one seed."""
+    """Return the authors' released curve of a task and variant up to ``budget`` environment steps, as a record of one seed."""
     points = [point for point in released_curves()[task, variant] if point[0] <= budget]
     return Record(f"{AUTHORS}/{task}-{variant}", tuple({"seed": 0, "env_steps": at, SUCCESS: value} for at, value in points))
 
@@ -88,7 +94,7 @@ def show_seeds(record: Record) -> str:
     return f"{record.seeds[0]} to {record.seeds[-1]}" if len(record.seeds) > 1 else str(record.seeds[0])
 
 
-def _of_seeds(record: Record, text: Callable[[], str]) -> str:
+def _if_several_seeds(record: Record, text: Callable[[], str]) -> str:
     return text() if len(record.seeds) > 1 else ""
 
 
@@ -108,58 +114,71 @@ def steps_to(level: float, *references: Record) -> Column:
     return Column(f"steps to {level:g}", cell)
 
 
-def at(steps: int, digits: int = 2, metric: str = SUCCESS, title: str | None = None) -> Column:
-    """Return the column of the median at one evaluation."""
+def median_at(steps: int, digits: int = 2, metric: str = SUCCESS, title: str | None = None) -> Column:
+    """Return the column of a metric's median over seeds at one evaluation; a cell is empty if there is none.
+
+    Args:
+        steps: Environment steps of the evaluation.
+        digits: Number of decimals.
+        metric: Name of the metric.
+        title: Title of the column; None for ``steps``.
+    """
 
     def cell(record: Record) -> str:
         values = record.at(steps, metric)
         return "" if values is None else f"{np.median(values):.{digits}f}"
 
-    return Column(title or show_steps(steps), cell)
+    return Column(title or format_steps(steps), cell)
 
 
-def of_seeds(steps: int, digits: int = 2) -> Column:
-    """Return the column of every seed's success at one evaluation."""
+def values_at(steps: int, digits: int = 2) -> Column:
+    """Return the column of every seed's success at the evaluation at ``steps``, with ``digits`` decimals; empty without it."""
 
     def cell(record: Record) -> str:
         values = record.at(steps)
         return "" if values is None else ", ".join(f"{value:.{digits}f}" for value in values)
 
-    return Column(show_steps(steps), cell)
+    return Column(format_steps(steps), cell)
 
 
 def min_success(steps: int) -> Column:
-    """Return the column of the minimum success over seeds at one evaluation."""
+    """Return the column of the minimum success over seeds at the evaluation at ``steps``; empty without that evaluation."""
 
     def cell(record: Record) -> str:
         values = record.at(steps)
         return "" if values is None else f"{values.min():.2f}"
 
-    return Column(f"least at {show_steps(steps)}", cell)
+    return Column(f"least at {format_steps(steps)}", cell)
 
 
 def mean_at(steps: int) -> Column:
-    """Return the column of the mean success over seeds at one evaluation."""
+    """Return the column of the mean success over seeds at the evaluation at ``steps``; empty without that evaluation."""
 
     def cell(record: Record) -> str:
         values = record.at(steps)
         return "" if values is None else f"{values.mean():.2f}"
 
-    return Column(show_steps(steps), cell)
+    return Column(format_steps(steps), cell)
 
 
 def success_at(steps: int) -> Column:
-    """Return the column of median success and quartiles over seeds at one evaluation."""
+    """Return the column of median and quartiles of success over seeds at the evaluation at ``steps``; empty without it."""
 
     def cell(record: Record) -> str:
         values = record.at(steps)
         return "" if values is None else band(values)
 
-    return Column(f"success at {show_steps(steps)}", cell)
+    return Column(f"success at {format_steps(steps)}", cell)
 
 
 def final(metric: str = SUCCESS, title: str = "success at the end", digits: int = 3) -> Column:
-    """Return the column of median and quartiles over seeds at the last evaluation."""
+    """Return the column of median and quartiles of a metric over seeds at the last evaluation; empty if it was not recorded.
+
+    Args:
+        metric: Name of the metric.
+        title: Title of the column.
+        digits: Number of decimals.
+    """
 
     def cell(record: Record) -> str:
         values = record.at(record.end, metric)
@@ -174,7 +193,13 @@ def final_distance() -> Column:
 
 
 def final_median(metric: str, title: str, digits: int = 3) -> Column:
-    """Return the column of the median at the last evaluation."""
+    """Return the column of a metric's median over seeds at the last evaluation; empty if it was not recorded.
+
+    Args:
+        metric: Name of the metric.
+        title: Title of the column.
+        digits: Number of decimals.
+    """
 
     def cell(record: Record) -> str:
         values = record.at(record.end, metric)
@@ -184,21 +209,37 @@ def final_median(metric: str, title: str, digits: int = 3) -> Column:
 
 
 def training_mean(metric: str, title: str, digits: int = 3) -> Column:
-    """Return the column of the median over seeds of the mean over training."""
+    """Return the column of the median over seeds of a metric's mean over training.
+
+    Args:
+        metric: Name of the metric.
+        title: Title of the column.
+        digits: Number of decimals.
+    """
     return Column(title, lambda record: f"{np.median(record.means(metric=metric)):.{digits}f}")
 
 
 def mean_success(budget: int | None = None) -> Column:
-    """Return the column of the interquartile mean over seeds of the mean success up to a budget, with bootstrap interval."""
-    title = f"mean success to {show_steps(budget)}" if budget else "mean success over training"
-    return Column(f"{title}, IQM (95 %)", lambda record: _of_seeds(record, lambda: interval(record.means(budget))))
+    """Return the column of the interquartile mean over seeds of the mean success, with 95 % bootstrap interval.
+
+    Args:
+        budget: Environment steps up to which success is averaged; None for all.
+    """
+    title = f"mean success to {format_steps(budget)}" if budget else "mean success over training"
+    return Column(f"{title}, IQM (95 %)", lambda record: _if_several_seeds(record, lambda: interval(record.means(budget))))
 
 
-def p(reference: Record, label: str, budget: int | None = None) -> Column:
-    """Return the column of the p-value of the permutation test of mean success against a reference."""
+def p_value_against(reference: Record, label: str, budget: int | None = None) -> Column:
+    """Return the column of the p-value of the permutation test of mean success against a reference.
+
+    Args:
+        reference: Record to compare with; its own cell is empty, as are those of single seeds.
+        label: Name of the reference in the title.
+        budget: Environment steps up to which success is averaged; None for all.
+    """
 
     def cell(record: Record) -> str:
-        return "" if record is reference else _of_seeds(record, lambda: show_p(p_value(record, reference, budget)))
+        return "" if record is reference else _if_several_seeds(record, lambda: show_p(p_value(record, reference, budget)))
 
     return Column(f"p against {label}", cell)
 
@@ -226,7 +267,10 @@ def final_precision() -> Column:
 
 
 def distance_to_authors(task: str, variant: str) -> Column:
-    """Return the column of the mean absolute difference between the median and the authors' released curve."""
+    """Return the column of the mean absolute difference between the median success and the authors' released curve.
+
+    With its 95 % bootstrap interval over seeds; empty for the authors' curve itself.
+    """
     curve = released_curves()[task, variant]
 
     def cell(record: Record) -> str:
@@ -239,7 +283,7 @@ def distance_to_authors(task: str, variant: str) -> Column:
 
 
 def _resampled_medians(record: Record, count: int = 2_000) -> list[list[tuple[int, float]]]:
-    """Return median curves of bootstrap samples of seeds."""
+    """Return the median success curves, pairs of (environment steps, success), of ``count`` bootstrap samples of seeds."""
     steps = [at for at, _ in record.points]
     success = np.stack([record.at(at) for at in steps])
     draws = np.random.default_rng(0).integers(len(record.seeds), size=(count, len(record.seeds)))

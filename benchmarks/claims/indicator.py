@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from benchmarks.claims import columns as c
 from benchmarks.claims.markdown import Row, table
 from benchmarks.claims.records import DISTANCE, SUCCESS, Record, study
-from jaxrl_vis.report.plots import show_steps
+from jaxrl_vis.report.plots import format_steps
 from jaxrl_vis.studies.indicator import FETCH, FINGER, HAND, REACHER, SAWYER
 
 LAB, GUIDE = "docs/lab/indicator.md", "docs/indicator_rewards.md"
@@ -28,7 +28,7 @@ _PARTS = {
 
 @functools.cache
 def run(task: str, variant: str) -> Record:
-    """Return a run of these studies, with fresh seeds if there are any."""
+    """Return the run of a variant of rewards on a task, with fresh seeds if there are any."""
     return study("indicator", f"{task}-{variant}-fast", is_fresh=True)
 
 
@@ -36,17 +36,25 @@ def _rows(task: str, labels: Mapping[str, str]) -> list[Row]:
     return [Row(label, run(task, variant)) for variant, label in labels.items()]
 
 
-def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, more: Sequence[c.Column] = ()) -> str:
-    """Return the table of results at the end and over training, with a test against one of the rows."""
+def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, extra_columns: Sequence[c.Column] = ()) -> str:
+    """Return the Markdown table of results at the end and over training, with a test against one of the rows.
+
+    Args:
+        task: Name of the environment.
+        labels: First cell of each row, by variant.
+        reference: Variant that the others are tested against.
+        label: Name of the reference in the title of the test's column.
+        extra_columns: Further columns.
+    """
     base = run(task, reference)
     columns = [
         c.final(),
         c.final_distance(),
         c.mean_success(),
-        c.p(base, label),
-        *more,
+        c.p_value_against(base, label),
+        *extra_columns,
     ]
-    return table([f"{task}, {show_steps(base.end)} steps"], _rows(task, labels), columns)
+    return table([f"{task}, {format_steps(base.end)} steps"], _rows(task, labels), columns)
 
 
 def _rewards(task: str, precision: bool) -> str:
@@ -97,7 +105,7 @@ def _cameras() -> str:
         return "" if record is reference else c.show_p(c.p_value(record, reference))
 
     columns = [c.final(), c.final_distance(), c.mean_success(), c.Column("p against plain images", p_cell)]
-    return table([f"{FETCH}, {show_steps(oracle.end)} steps"], _rows(FETCH, own), columns)
+    return table([f"{FETCH}, {format_steps(oracle.end)} steps"], _rows(FETCH, own), columns)
 
 
 def _main() -> str:
@@ -109,7 +117,7 @@ def _main() -> str:
                 continue
             record = run(task, variant)
             oracles[record] = run(task, "oracle")
-            rows.append(Row(f"{task}, {show_steps(record.end)} steps" if variant == "oracle" else "", record, [label]))
+            rows.append(Row(f"{task}, {format_steps(record.end)} steps" if variant == "oracle" else "", record, [label]))
 
     def p_cell(record: Record) -> str:
         return "" if record is oracles[record] else c.show_p(c.p_value(record, oracles[record]))

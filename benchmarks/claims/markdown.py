@@ -19,38 +19,38 @@ class Row:
     Attributes:
         label: First cell.
         record: Run from which the other cells are computed; None if no record is stored.
-        more: Cells between the label and the computed ones.
+        cells: Cells between the label and the computed ones.
     """
 
     label: str
     record: Record | None
-    more: Sequence[str] = ()
+    cells: Sequence[str] = ()
 
 
 def table(heads: Sequence[str], rows: Sequence[Row], columns: Sequence[Column]) -> str:
     """Format a table as Markdown, followed by revision and device of the records, if known.
 
     Args:
-        heads: Titles of the label and of the cells in ``more``.
+        heads: Titles of the label and of `Row.cells`.
         rows: Rows.
         columns: Computed columns.
     """
     lines = [_line([*heads, *(column.title for column in columns)]), "|" + "---|" * (len(heads) + len(columns))]
     for row in rows:
         cells = [NO_RECORD, *[""] * (len(columns) - 1)] if row.record is None else [c.cell(row.record) for c in columns]
-        lines.append(_line([row.label, *row.more, *cells]))
-    made = made_by([row.record for row in rows if row.record is not None])
+        lines.append(_line([row.label, *row.cells, *cells]))
+    made = origin_sentence([row.record for row in rows if row.record is not None])
     return "\n".join([*lines, *(["", made] if made else [])])
 
 
-def made_by(records: Sequence[Record]) -> str:
+def origin_sentence(records: Sequence[Record]) -> str:
     """Return a sentence on the revisions and devices of records; empty if none is known."""
     devices = collections.defaultdict(set)
-    for text in {text for record in records for text in record.made}:
+    for text in {text for record in records for text in record.origins}:
         revision, _, device = text.partition(" on ")
         devices[device].add(revision)
     parts = [f"{', '.join(sorted(revisions))} on {device}" for device, revisions in sorted(devices.items())]
-    some = "" if all(record.made for record in records) else " (records that say so)"
+    some = "" if all(record.origins for record in records) else " (records that say so)"
     return textwrap.fill(f"Made by {'; '.join(parts)}{some}.", WIDTH) if parts else ""
 
 

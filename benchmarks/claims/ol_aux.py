@@ -27,13 +27,19 @@ LABELS = {
 
 
 def run(task: str, variant: str, view: str = "") -> Record:
-    """Return the run for figures: seeds 0 to 4."""
+    """Return the run for figures: seeds 0 to 4 of a task with a variant of auxiliary losses, and a view if given."""
     return study("ol_aux", f"{task}-{variant}-paper" + (f"-{view}" if view else ""))
 
 
 @functools.cache
 def claim(task: str, variant: str, budget: int | None = None) -> Record:
-    """Return the run for claims, with fresh seeds if there are any."""
+    """Return the run of a variant of auxiliary losses on a task for claims, with fresh seeds if any ran for the budget.
+
+    Args:
+        task: Name of the environment.
+        variant: Name of the variant, a key of `LABELS`.
+        budget: Environment steps that fresh seeds must have; None for the task's in `BUDGETS`.
+    """
     return study("ol_aux", f"{task}-{variant}-paper", is_fresh=True, budget=budget or BUDGETS[task])
 
 
@@ -48,8 +54,8 @@ def _figure_5_4(
     columns = [
         *(c.steps_to(level, records["none"], released["none"]) for level in levels),
         c.mean_success(budget),
-        c.p(records["none"], "without", budget),
-        *([c.p(records["ol_aux_5"], "OL-AUX-5", budget)] if len(variants) > 2 else []),
+        c.p_value_against(records["none"], "without", budget),
+        *([c.p_value_against(records["ol_aux_5"], "OL-AUX-5", budget)] if len(variants) > 2 else []),
         *(c.success_at(end) for end in ends),
     ]
     return table([task + (" as the authors saw it" if view else "")], rows, columns)
@@ -61,8 +67,8 @@ def _figure_5_5(task: str, levels: Sequence[float], ends: Sequence[int]) -> str:
     columns = [
         *(c.steps_to(level, records["none"]) for level in levels),
         c.mean_success(budget),
-        c.p(records["none"], "without", budget),
-        c.p(records["ol_aux_5"], "OL-AUX-5", budget),
+        c.p_value_against(records["none"], "without", budget),
+        c.p_value_against(records["ol_aux_5"], "OL-AUX-5", budget),
         *(c.success_at(end) for end in ends),
     ]
     return table([task], [Row(LABELS[variant], record) for variant, record in records.items()], columns)
@@ -70,12 +76,16 @@ def _figure_5_5(task: str, levels: Sequence[float], ends: Sequence[int]) -> str:
 
 def _figure_5_7(task: str, budget: int, columns: Sequence[c.Column]) -> str:
     records = {variant: run(task, variant) for variant in ("none", "ol_aux_1", "ol_aux_5_ablation", "ol_aux_5")}
-    columns = [*columns, c.mean_success(budget), c.p(records["ol_aux_5"], "OL-AUX-5", budget)]
+    columns = [*columns, c.mean_success(budget), c.p_value_against(records["ol_aux_5"], "OL-AUX-5", budget)]
     return table([task], [Row(LABELS[variant], record) for variant, record in records.items()], columns)
 
 
 def rank_correlation(task: str) -> float:
-    """Return Spearman's rank correlation between a loss's mean weight in OL-AUX-5 and its gain when used alone."""
+    """Return Spearman's rank correlation, over the auxiliary losses, of weight and gain.
+
+    The weight is the median over seeds of a loss's mean weight in OL-AUX-5. The gain is the mean success up to the budget
+    with that loss alone, minus that without auxiliary losses.
+    """
     base = np.mean([success for steps, success in run(task, "none").points if steps <= BUDGETS[task]])
     gains = [np.mean([v for steps, v in run(task, name).points if steps <= BUDGETS[task]]) - base for name in AUX_TASKS]
     weights = [np.median(run(task, "ol_aux_5").means(metric=f"train/weight/{name}")) for name in AUX_TASKS]
@@ -85,7 +95,7 @@ def rank_correlation(task: str) -> float:
 def _weights() -> str:
     tasks = {run(task, "ol_aux_5"): task for task in (FETCH, HAND, FINGER)}
     correlation = c.Column("rank correlation with the gain alone", lambda record: f"{rank_correlation(tasks[record]):+.1f}")
-    rows = [Row(f"{task}, to {c.show_steps(record.points[-1][0])}", record) for record, task in tasks.items()]
+    rows = [Row(f"{task}, to {c.format_steps(record.points[-1][0])}", record) for record, task in tasks.items()]
     return table(["mean weight over training"], rows, [*c.weights(AUX_TASKS), correlation])
 
 
@@ -110,7 +120,7 @@ def _departures() -> str:
     columns = [
         c.distance_to_authors(FETCH, "none"),
         c.mean_success(budget),
-        c.p(base, "`paper`", budget),
+        c.p_value_against(base, "`paper`", budget),
         *(c.mean_at(count * 1000) for count in (60, 80, 100, 120, 160, 200)),
         c.names(),
     ]
@@ -135,7 +145,7 @@ def _gaps() -> str:
     rows = [Row(label, record) for label, record in [*hand, *finger]]
     at_end = {id(record): 600_000 for _, record in hand} | {id(record): 1_400_000 for _, record in finger}
     success = c.Column("success", lambda record: f"{record.median(at_end[id(record)]):.2f}")
-    steps = c.Column("environment steps", lambda record: c.show_steps(at_end[id(record)]))
+    steps = c.Column("environment steps", lambda record: c.format_steps(at_end[id(record)]))
     return table(["undone"], rows, [c.seeds(), steps, success, c.names()])
 
 
@@ -147,7 +157,9 @@ def _fresh(task: str) -> str:
     order = sorted(records, key=lambda variant: list(LABELS).index(variant) if variant in LABELS else len(LABELS))
     columns = [c.seeds(), c.mean_success(budget)]
     columns += [
-        c.p(records[variant], LABELS[variant], budget) for variant in ("none", "balance", "ol_aux_5") if variant in records
+        c.p_value_against(records[variant], LABELS[variant], budget)
+        for variant in ("none", "balance", "ol_aux_5")
+        if variant in records
     ]
     rows = [Row(LABELS.get(variant, f"`{variant}`"), records[variant]) for variant in order]
     return table([task], rows, columns) if rows else f"{task}: no run with fresh seeds is kept."
@@ -161,7 +173,7 @@ def _main() -> str:
             record = claim(task, variant)
             base[record] = (claim(task, "none"), BUDGETS[task])
             label = f"{LABELS[variant]} alone" if variant in AUX_TASKS else LABELS[variant]
-            rows.append(Row(f"{task}, to {c.show_steps(BUDGETS[task])}" if variant == "none" else "", record, [label]))
+            rows.append(Row(f"{task}, to {c.format_steps(BUDGETS[task])}" if variant == "none" else "", record, [label]))
 
     def p_cell(record: Record) -> str:
         reference, budget = base[record]
@@ -182,7 +194,7 @@ def _options() -> str:
     rows += [Row(f"`{variant}`", run(FETCH, variant)) for variant in OPTIONS if _is_kept(FETCH, variant)]
     weights = [f"train/weight/{name}" for name in AUX_TASKS]
     total = c.Column("sum of weights at the end", lambda record: f"{sum(record.median(metric=name) for name in weights):.0f}")
-    return table([FETCH], rows, [c.mean_success(budget), c.p(base, "OL-AUX-5", budget), total, c.names()])
+    return table([FETCH], rows, [c.mean_success(budget), c.p_value_against(base, "OL-AUX-5", budget), total, c.names()])
 
 
 def _is_kept(task: str, variant: str) -> bool:

@@ -26,12 +26,12 @@ class Record:
     Attributes:
         name: Path below benchmarks/results, without file suffixes.
         rows: Evaluations of all seeds.
-        made: Revision and device of each run, as text; empty if neither is known.
+        origins: Revision and device of each run, as text; empty if neither is known.
     """
 
     name: str
     rows: tuple[dict[str, Any], ...]
-    made: frozenset[str] = frozenset()
+    origins: frozenset[str] = frozenset()
 
     @functools.cached_property
     def seeds(self) -> list[int]:
@@ -82,9 +82,11 @@ class Record:
         return np.array([np.mean([row[metric] for row in rows if row["seed"] == seed]) for seed in self.seeds])
 
 
-def _merge_records(name: str, parts: Iterable[Record]) -> Record:
-    parts = list(parts)
-    return Record(name, tuple(row for part in parts for row in part.rows), frozenset().union(*(part.made for part in parts)))
+def _merge_records(name: str, records: Iterable[Record]) -> Record:
+    records = list(records)
+    return Record(
+        name, tuple(row for part in records for row in part.rows), frozenset().union(*(part.origins for part in records))
+    )
 
 
 def _evaluations(file: Path) -> tuple[dict[str, Any], ...]:
@@ -97,7 +99,11 @@ _curves = functools.cache(read_curves)
 
 @functools.cache
 def ablation(name: str) -> Record:
-    """Return a curve of the table of ablations, with revision and device as far as the docs state them."""
+    """Return a curve of benchmarks/results/ablations, with revision and device as far as they are known.
+
+    Raises:
+        KeyError: No curve has this name.
+    """
     curve = _curves()[name]
     made = frozenset({f"{curve.revision} on {curve.device}"} if curve.revision and curve.device else ())
     return Record(f"ablations/{name}", tuple(row for row in curve.rows if SUCCESS in row), made)
@@ -109,7 +115,7 @@ def learning(*names: str) -> Record:
     folder, parts = RESULTS / "learning", []
     for name in names:
         about = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-        made = frozenset({_made(about["revision"], about["device"])})
+        made = frozenset({_format_origin(about["revision"], about["device"])})
         parts.append(Record(f"learning/{name}", _evaluations(folder / f"{name}.metrics.jsonl"), made))
     return _merge_records(", ".join(part.name for part in parts), parts)
 
@@ -164,10 +170,10 @@ def _folders(family: str, stem: str) -> dict[int, Path]:
 @functools.cache
 def _read_run(folder: Path) -> Record:
     about = read_record(folder)
-    made = frozenset({_made(about["git_revision"], about["device"])})
+    made = frozenset({_format_origin(about["git_revision"], about["device"])})
     return Record(folder.relative_to(RESULTS).as_posix(), _evaluations(folder / "metrics.jsonl"), made)
 
 
-def _made(revision: str, device: dict[str, Any]) -> str:
+def _format_origin(revision: str, device: dict[str, Any]) -> str:
     kind = device.get("kind") or f"{device.get('cpu_count')} CPU cores"
     return f"{revision[:7]} on {kind if device['platform'] != 'cpu' else str(device['cpu_count']) + ' CPU cores'}"

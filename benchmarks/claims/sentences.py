@@ -265,7 +265,7 @@ def _parts_of_the_method() -> Iterator[Sentence]:
     ]
     yield Sentence(RULES, "all are level with plain images", run(FETCH, "ours_noise").name, level == ["level"] * 4)
     fast, slow = learning("fetch_reach_oracle").steps_to(0.97), run(FETCH, "oracle").steps_to(0.97)
-    quote = f"the oracle is at 0.97 after {c.show_steps(fast)} steps in the place of {c.show_steps(slow)}"
+    quote = f"the oracle is at 0.97 after {c.format_steps(fast)} steps in the place of {c.format_steps(slow)}"
     yield Sentence(RULES, quote, "learning/fetch_reach_oracle")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.claims import columns as c
 from benchmarks.claims import indicator, ol_aux
 from benchmarks.claims.indicator import OURS, REACHER, SAWYER
-from benchmarks.claims.markdown import made_by
+from benchmarks.claims.markdown import origin_sentence
 from benchmarks.claims.records import DISTANCE, SUCCESS, Record, study
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND
 
@@ -34,12 +34,12 @@ class Comparison:
     """Comparison of two records' mean success up to a budget.
 
     Attributes:
-        place: Task and budget as text.
+        setting: Task and budget as text.
         first, second: The records.
-        budget: Environment steps; None: all.
+        budget: Environment steps up to which success is averaged; None for all.
     """
 
-    place: str
+    setting: str
     first: Record
     second: Record
     budget: int | None = None
@@ -54,7 +54,7 @@ class Comparison:
         """Interquartile means with intervals, and the p-value, as text."""
         means = " against ".join(c.interval(record.means(self.budget)) for record in (self.first, self.second))
         p = c.show_p(c.p_value(self.first, self.second, self.budget))
-        return f"{self.place}: {means}, p {p}" if p.startswith("<") else f"{self.place}: {means}, p = {p}"
+        return f"{self.setting}: {means}, p {p}" if p.startswith("<") else f"{self.setting}: {means}, p = {p}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Claim:
 def _ol_aux(first: str, second: str, tasks: Mapping[str, int]) -> list[Comparison]:
     return [
         Comparison(
-            f"{SHORT[task]} to {c.show_steps(budget)}",
+            f"{SHORT[task]} to {c.format_steps(budget)}",
             ol_aux.claim(task, first, budget),
             ol_aux.claim(task, second, budget),
             budget,
@@ -96,35 +96,40 @@ def _rewards(first: str, second: str, tasks: Sequence[str]) -> list[Comparison]:
     return [Comparison(SHORT[task], indicator.run(task, first), indicator.run(task, second)) for task in tasks]
 
 
-def _answer(comparisons: Sequence[Comparison], wanted: Sequence[str] = ("better",)) -> str:
-    right = [comparison.verdict in wanted for comparison in comparisons]
+def _answer(comparisons: Sequence[Comparison], expected: Sequence[str] = ("better",)) -> str:
+    right = [comparison.verdict in expected for comparison in comparisons]
     return HOLDS if all(right) else PARTLY if any(right) else FAILS
 
 
 def _findings(comparisons: Sequence[Comparison]) -> str:
     verdicts: dict[str, list[str]] = {}
     for comparison in comparisons:
-        verdicts.setdefault(comparison.verdict, []).append(comparison.place)
+        verdicts.setdefault(comparison.verdict, []).append(comparison.setting)
     return "; ".join(f"{verdict}: {', '.join(places)}" for verdict, places in verdicts.items())
 
 
-def _comparison_rows(
-    claim: str, comparisons: Sequence[Comparison], source: str, wanted: Sequence[str] = ("better",), note: str = ""
+def _comparison_claim(
+    claim: str, comparisons: Sequence[Comparison], source: str, expected: Sequence[str] = ("better",), note: str = ""
 ) -> Claim:
     records = [record for comparison in comparisons for record in (comparison.first, comparison.second)]
     finding = _findings(comparisons) + (f". {note}" if note else "")
     return Claim(
-        claim, _answer(comparisons, wanted), finding, "; ".join(comparison.text for comparison in comparisons), source, records
+        claim,
+        _answer(comparisons, expected),
+        finding,
+        "; ".join(comparison.text for comparison in comparisons),
+        source,
+        records,
     )
 
 
 def _better_than_none() -> Claim:
     comparisons = _ol_aux("ol_aux_5", "none", ol_aux.BUDGETS)
-    return _comparison_rows("OL-AUX-5 learns faster than no auxiliary losses", comparisons, f"[5.4]({_LAB}#figure-54)")
+    return _comparison_claim("OL-AUX-5 learns faster than no auxiliary losses", comparisons, f"[5.4]({_LAB}#figure-54)")
 
 
 def _better_than_logarithm() -> Claim:
-    return _comparison_rows(
+    return _comparison_claim(
         "Our control: OL-AUX-5 learns faster than the logarithm of the main loss alone",
         _ol_aux("ol_aux_5", "none_log", ol_aux.BUDGETS),
         f"[fresh seeds]({_LAB}#fresh-seeds)",
@@ -132,7 +137,16 @@ def _better_than_logarithm() -> Claim:
 
 
 def with_decay(task: str, variant: str, decay: float) -> Record:
-    """Return the run with a decay of the target networks; for the hand, with the authors' view."""
+    """Return the run with a decay of the target networks; for the hand, with the authors' view.
+
+    Args:
+        task: Name of the task.
+        variant: Weighting or auxiliary loss, as in the study.
+        decay: Fraction of the old parameters that a target network keeps in an update; 0.98 in `paper`.
+
+    Raises:
+        LookupError: No such run is stored.
+    """
     stem = f"{task}-{variant}-paper" if task != HAND else f"{HAND}-view=fingertips-{variant}-paper"
     if decay != 0.98:
         return study("target_decay", f"{stem}-decay{decay:g}", is_fresh=True)
@@ -161,7 +175,7 @@ def _speed_ups() -> Claim:
     for task, label in words.items():
         budget = ol_aux.BUDGETS[task]
         pair = (with_decay(task, "ol_aux_5", 0.95), with_decay(task, "none", 0.95))
-        comparisons.append(Comparison(f"{label} at 0.95, to {c.show_steps(budget)}", *pair, budget))
+        comparisons.append(Comparison(f"{label} at 0.95, to {c.format_steps(budget)}", *pair, budget))
     return Claim(
         "OL-AUX-5 needs 2 times fewer steps on Fetch, about 3 times fewer on hand and finger",
         _answer(comparisons),
@@ -177,9 +191,9 @@ def _single_tasks() -> Claim:
     for task, budget in ol_aux.BUDGETS.items():
         records = {name: ol_aux.claim(task, name) for name in AUX_TASKS}
         best = max(records, key=lambda name: records[name].means(budget).mean())
-        place = f"{SHORT[task]} to {c.show_steps(budget)} (best: {best.replace('_', ' ')})"
+        place = f"{SHORT[task]} to {c.format_steps(budget)} (best: {best.replace('_', ' ')})"
         comparisons.append(Comparison(place, ol_aux.claim(task, "ol_aux_5"), records[best], budget))
-    return _comparison_rows(
+    return _comparison_claim(
         "OL-AUX-5 is always better than, or level with, the best single task",
         comparisons,
         f"[5.5]({_LAB}#figure-55)",
@@ -191,19 +205,19 @@ def _best_single_task() -> Claim:
     budget, label = ol_aux.BUDGETS[HAND], "inverse_dynamics"
     others = {name: ol_aux.claim(HAND, name) for name in AUX_TASKS if name != label}
     second = max(others, key=lambda name: others[name].means(budget).mean())
-    place = f"hand to {c.show_steps(budget)}, against the second best ({second.replace('_', ' ')})"
+    place = f"hand to {c.format_steps(budget)}, against the second best ({second.replace('_', ' ')})"
     comparison = Comparison(place, ol_aux.claim(HAND, label), others[second], budget)
-    return _comparison_rows("Inverse dynamics is the best single task on the hand", [comparison], f"[5.5]({_LAB}#figure-55)")
+    return _comparison_claim("Inverse dynamics is the best single task on the hand", [comparison], f"[5.5]({_LAB}#figure-55)")
 
 
 def _balance() -> Claim:
     comparisons = [*_ol_aux("ol_aux_5", "balance", ol_aux.BUDGETS), *_ol_aux("ol_aux_5", "balance", {HAND: 2_000_000})]
-    return _comparison_rows("OL-AUX-5 improves on gradient balancing", comparisons, f"[5.4]({_LAB}#figure-54)")
+    return _comparison_claim("OL-AUX-5 improves on gradient balancing", comparisons, f"[5.4]({_LAB}#figure-54)")
 
 
 def _balance_and_none() -> Claim:
     comparisons = _ol_aux("balance", "none", ol_aux.BUDGETS)
-    return _comparison_rows(
+    return _comparison_claim(
         "Gradient balancing is better than none in all environments", comparisons, f"[5.4]({_LAB}#figure-54)"
     )
 
@@ -211,19 +225,19 @@ def _balance_and_none() -> Claim:
 def _cosine() -> Claim:
     comparisons = _ol_aux("cosine", "none", ol_aux.BUDGETS)
     note = "On Fetch the gate is that of the thesis; on hand and finger it also stops the head of a loss"
-    return _comparison_rows(
+    return _comparison_claim(
         "Cosine similarity is better than none (figure 5.4)", comparisons, f"[5.4]({_LAB}#figure-54)", note=note
     )
 
 
 def _n_steps() -> Claim:
     comparisons = _ol_aux("ol_aux_5", "ol_aux_1", {FETCH: 240_000, HAND: 600_000})
-    return _comparison_rows("OL-AUX-1 is much worse than OL-AUX-5", comparisons, f"[5.7]({_LAB}#figure-57)")
+    return _comparison_claim("OL-AUX-1 is much worse than OL-AUX-5", comparisons, f"[5.7]({_LAB}#figure-57)")
 
 
 def _ablation() -> Claim:
     comparisons = _ol_aux("ol_aux_5", "ol_aux_5_ablation", {FETCH: 240_000, HAND: 600_000})
-    return _comparison_rows("The ablation of OL-AUX-5 is worse than OL-AUX-5", comparisons, f"[5.7]({_LAB}#figure-57)")
+    return _comparison_claim("The ablation of OL-AUX-5 is worse than OL-AUX-5", comparisons, f"[5.7]({_LAB}#figure-57)")
 
 
 def _order() -> Claim:
@@ -250,12 +264,12 @@ def _oracle() -> Claim:
     ends = {metric: ", ".join(_ends(task, pair, metric) for task in tasks) for metric in (SUCCESS, DISTANCE)}
     note = f"Success at the end: {ends[SUCCESS]}; distance at the end in m: {ends[DISTANCE]}"
     claim = "Indicator, balanced and filtered, performs as well as the oracle"
-    return _comparison_rows(claim, _rewards(OURS, "oracle", tasks), f"[5.1, 5.2]({_INDICATOR})", ("better", "level"), note)
+    return _comparison_claim(claim, _rewards(OURS, "oracle", tasks), f"[5.1, 5.2]({_INDICATOR})", ("better", "level"), note)
 
 
 def _balancing() -> Claim:
     comparisons = _rewards(OURS, "indicator", (FETCH, SAWYER))
-    return _comparison_rows(
+    return _comparison_claim(
         "Balancing and filtering improve on the plain indicator (Fetch and Sawyer)", comparisons, f"[5.1, 5.2]({_INDICATOR})"
     )
 
@@ -286,24 +300,24 @@ def _filter() -> Claim:
 def _false_positives() -> Claim:
     comparisons = _rewards("false_positives", "oracle", (FETCH,)) + _rewards("clutter", "oracle", (FETCH,))
     named = [
-        dataclasses.replace(comparison, place=f"Fetch, {place}")
+        dataclasses.replace(comparison, setting=f"Fetch, {place}")
         for comparison, place in zip(comparisons, ("anywhere", "in a cluttered quarter"), strict=True)
     ]
     claim = "False positives of a state estimator harm (here one in ten negatives is paid as a positive)"
-    return _comparison_rows(claim, named, f"[estimators]({_INDICATOR}#state-estimators-that-err)", ("worse",))
+    return _comparison_claim(claim, named, f"[estimators]({_INDICATOR}#state-estimators-that-err)", ("worse",))
 
 
 def _ablation_rows(variant: str, claim: str) -> Claim:
     comparisons = _rewards(variant, OURS, (REACHER, FETCH))
     note = "Success at the end: " + ", ".join(_ends(task, (variant, OURS)) for task in (REACHER, FETCH))
     source = f"[parts of the method]({_INDICATOR}#what-each-part-of-the-method-gives)"
-    return _comparison_rows(claim, comparisons, source, ("worse",), note)
+    return _comparison_claim(claim, comparisons, source, ("worse",), note)
 
 
 def _finger() -> Claim:
     comparisons = _rewards(OURS, "oracle", (FINGER,)) + _rewards("autoencoder", "oracle", (FINGER,))
     named = [
-        dataclasses.replace(comparison, place=f"finger, {method}")
+        dataclasses.replace(comparison, setting=f"finger, {method}")
         for comparison, method in zip(comparisons, ("indicator, balanced and filtered", "autoencoder"), strict=True)
     ]
     ends = [indicator.run(FINGER, variant).median() for variant in (OURS, "oracle", "autoencoder")]
@@ -367,7 +381,7 @@ def _table() -> str:
     lines += [
         f"| {row.claim} | {row.answer} | {row.finding} | {row.interval} | {_seeds(row)} | {row.source} |" for row in claims()
     ]
-    made = made_by([record for row in claims() for record in row.records])
+    made = origin_sentence([record for row in claims() for record in row.records])
     return "\n".join([*lines, "", made])
 
 

@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None, checkout: Path = CHECKOUT) -> int:
                 print(f"{page.relative_to(checkout)}: {'written' if changed else 'unchanged'}")
             return 0
         if options.action == "keep":
-            print(*evidence.keep(options.run, options.name, options.results), sep="\n")
+            print(*evidence.keep_run(options.run, options.name, options.results), sep="\n")
             return 0
         lines = complaints(options.results, checkout)
     except RequestError as error:

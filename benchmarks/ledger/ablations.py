@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from benchmarks.ledger.records import RESULTS
-from benchmarks.ledger.tables.lab_results import short
+from benchmarks.ledger.tables.lab_results import format_short
 
 FILE = "ablations.jsonl.gz"
 UNKNOWN = "unknown"
@@ -46,7 +46,7 @@ class Curve:
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """Return rows as in metrics.jsonl, one per seed and evaluation."""
+        """Rows as in metrics.jsonl, one per seed and evaluation."""
         return [dict(zip(self.metrics, values, strict=True)) for values in zip(*self.metrics.values(), strict=True)]
 
     @property
@@ -62,14 +62,14 @@ class Curve:
 
 
 def read_curves(results: Path = RESULTS) -> dict[str, Curve]:
-    """Read all curves by name."""
+    """Read the curves of all ablations, by name, in the order of the file."""
     with gzip.open(results / FILE, "rt", encoding="utf-8") as file:
         curves = map(Curve.parse, file)
         return {curve.name: curve for curve in curves}
 
 
 def index_table(results: Path = RESULTS) -> str:
-    """Write the table of docs/lab/ablations.md: every curve with its command and origin, as Markdown."""
+    """Return the table of docs/lab/ablations.md as Markdown: every curve with its command and origin."""
     lines = ["| curve | command | revision | device | success at the end | page |", "|---|---|---|---|---|---|"]
     for curve in read_curves(results).values():
         rows = curve.rows
@@ -78,6 +78,6 @@ def index_table(results: Path = RESULTS) -> str:
         command = f"`{curve.command}`" if curve.command else f"{UNKNOWN}; {curve.task}, `{curve.preset}`"
         page = "" if curve.page is None else f"[{Path(curve.page).stem}](../{curve.page.removeprefix(_PREFIX)})"
         revision = curve.revision or f"{UNKNOWN}, until {curve.stored}"
-        ending = f"{success:.2f} at {short(end)}"
+        ending = f"{success:.2f} at {format_short(end)}"
         lines.append(f"| {curve.name} | {command} | {revision} | {curve.device or UNKNOWN} | {ending} | {page} |")
     return "\n".join(lines)

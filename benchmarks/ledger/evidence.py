@@ -39,7 +39,7 @@ class Evidence:
     rows: list[dict[str, Any]]
 
 
-def keep(run: Path, name: str, results: Path) -> tuple[Path, Path]:
+def keep_run(run: Path, name: str, results: Path) -> tuple[Path, Path]:
     """Store the evidence of a finished run.
 
     Args:
@@ -99,6 +99,6 @@ def load(name: str, results: Path) -> Evidence | None:
 
 
 def seconds(rows: list[dict[str, Any]]) -> tuple[float, float]:
-    """Return the duration of a run until its last evaluation, and the part of it spent on compilation, s."""
+    """Return the duration of a run until its last evaluation, and the time of it that compilation took, s."""
     last = max(rows, key=lambda row: row["time/wall_s"])
     return last["time/wall_s"], last["time/compile_s"]

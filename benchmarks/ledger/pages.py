@@ -30,7 +30,7 @@ Writer = Callable[[Path], str | None]
 
 
 def renderer_parity(results: Path) -> str:
-    """Write the table of docs/lab/renderer_parity.md."""
+    """Return the table of docs/lab/renderer_parity.md as Markdown."""
     from benchmarks import render_parity  # imports the models of the tests
 
     return render_parity.table(render_parity.read_rows(results / render_parity.TARGET.name))
@@ -38,10 +38,10 @@ def renderer_parity(results: Path) -> str:
 
 def soak(results: Path) -> str | None:
     """Return the table of docs/reliability.md, summed over the records in ``soak``, as Markdown; None if there are none."""
-    from benchmarks.soak.record import Record, added
+    from benchmarks.soak.record import Record, add_records
 
     files = sorted((results / "soak").glob("*.json"))
-    return added([Record.read(file) for file in files]).table() if files else None
+    return add_records([Record.read(file) for file in files]).table() if files else None
 
 
 PAGES: dict[str, dict[str, Writer]] = {
@@ -93,7 +93,7 @@ def fill_page(text: str, of_page: dict[str, Writer], results: Path = RESULTS) ->
 
 
 def write_pages(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[tuple[Path, bool]]:
-    """Write the tables of every page; yield the page, and True if it changed.
+    """Write the tables of every page; yield the page's path, and True if it changed.
 
     Raises:
         RequestError: As in `fill_page`; or a page is missing.

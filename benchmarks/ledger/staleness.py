@@ -116,6 +116,12 @@ def staleness_reason(name: str, env: str | None, on_cpu: bool, revision: str, ch
         on_cpu: True if a CPU was measured.
         revision: Revision of the record.
         checkout: Git checkout of the revision.
+
+    Returns:
+        The first changed files and definitions; or that the record, its revision or its code is unknown.
+
+    Raises:
+        FileNotFoundError: A file listed in `MEASURED` does not exist.
     """
     if name not in MEASURED:
         return f"which code {name} measures is unknown: add it to MEASURED in {Path(__file__).name}"
@@ -203,7 +209,7 @@ def definitions(suffix: str, contents: bytes) -> tuple[tuple[str, str], ...]:
     for statement in ast.parse(contents).body:
         if isinstance(statement, ast.Import | ast.ImportFrom) or _is_text(statement):
             continue
-        plain: Any = _Plain().visit(statement)
+        plain: Any = _InertCodeRemover().visit(statement)
         names = [plain.name] if hasattr(plain, "name") else [target.id for target in _targets(plain)]
         statements.append((hashlib.sha256(ast.dump(plain).encode()).hexdigest(), ", ".join(names)))
     return tuple(statements)
@@ -220,7 +226,7 @@ def _is_text(statement: ast.AST) -> bool:
     )
 
 
-class _Plain(ast.NodeTransformer):
+class _InertCodeRemover(ast.NodeTransformer):
     """Remover of code without effect on a figure: docstrings, imports, function annotations, error messages."""
 
     def generic_visit(self, node: ast.AST) -> ast.AST:

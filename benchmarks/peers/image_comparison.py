@@ -150,8 +150,8 @@ def measure_beside_ours(
     """Return a benchmark that measures our renderer and a peer on the same poses, in the same call.
 
     Args:
-        check: Raises RequestError if the peer is missing.
-        measure_peer: Measures the peer; raises AssertionError if its images differ from ours.
+        check: Function that raises a `RequestError` if the peer is missing.
+        measure_peer: Function that measures the peer, and raises an AssertionError if its images differ from ours.
         min_poses: Minimum number of poses that the peer needs.
     """
 

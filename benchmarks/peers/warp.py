@@ -43,7 +43,7 @@ def check() -> None:
     """Check for the package and a GPU.
 
     Raises:
-        RequestError: One of them is missing.
+        RequestError: One of them is missing, or the package has another version than `VERSION`.
     """
     try:
         version = importlib.metadata.version("mujoco-warp")

@@ -24,7 +24,7 @@ import jax  # noqa: E402
 
 from benchmarks.ledger.records import RESULTS  # noqa: E402
 from benchmarks.pixels import gallery, playground, speed  # noqa: E402
-from jaxrl_vis.bench.conditions import Watch  # noqa: E402
+from jaxrl_vis.bench.conditions import ConditionMonitor  # noqa: E402
 from jaxrl_vis.bench.record import compare_and_keep  # noqa: E402
 from jaxrl_vis.errors import RequestError  # noqa: E402
 from jaxrl_vis.host.provenance import versions  # noqa: E402
@@ -35,7 +35,13 @@ PARITY_SIZE, IMAGE_SIZE = 128, 64  # pixels
 
 
 def measure_parity(tasks: Sequence[str], results: pathlib.Path, page: pathlib.Path | None) -> int:
-    """Compare all tasks, store their rows, and write the gallery; return the number of tasks that violate a bound."""
+    """Compare tasks with `mujoco.Renderer`, store their rows, and return the number of tasks that violate a bound.
+
+    Args:
+        tasks: Names of the tasks.
+        results: Folder of stored records; rows of other tasks in it are kept.
+        page: PNG file of the gallery; None for no gallery.
+    """
     from benchmarks.pixels import parity  # needs the models of the tests, and GL
 
     path = results / PARITY
@@ -61,13 +67,21 @@ def _short(measures: dict[str, Any]) -> str:
 
 
 def measure_speed(tasks: Sequence[str], results: pathlib.Path, envs: int | None, steps: int | None, repeats: int) -> None:
-    """Measure all tasks, and store the records."""
+    """Measure steps per second of tasks, and store the records.
+
+    Args:
+        tasks: Names of the tasks.
+        results: Folder of stored records.
+        envs: Number of environments; None for 1024, or 16 on a CPU.
+        steps: Steps per timed call; None for 50, or 10 on a CPU.
+        repeats: Maximum number of timed repeats.
+    """
     on_cpu = jax.default_backend() == "cpu"
     count, length = envs or (16 if on_cpu else 1024), steps or (10 if on_cpu else 50)
-    watch = Watch()
+    monitor = ConditionMonitor()
     for task in tasks:
         for measurement in speed.measure(task, count, length, IMAGE_SIZE, repeats):
-            compare_and_keep("pixels", measurement, results, watch.conditions())
+            compare_and_keep("pixels", measurement, results, monitor.conditions())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

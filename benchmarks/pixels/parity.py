@@ -35,7 +35,7 @@ class Comparison:
     tally: Tally
 
     def row(self, task: str, size: int) -> dict[str, Any]:
-        """Return the row of the record."""
+        """Return the row of the record for a ``task`` rendered with images of ``size`` x ``size`` pixels."""
         measures = {name: None if np.isnan(value) else round(value, 5) for name, value in self.tally.measures().items()}
         images = {"images": len(self.ours), "size": size, "device": jax.devices()[0].device_kind}
         return {"task": task, "camera": self.camera, **images, "measures": measures, "failures": self.tally.failures()}
@@ -94,7 +94,7 @@ def _mj_data(mj_model: mujoco.MjModel, poses: dict[str, np.ndarray], index: int)
 
 
 def _finely_drawn(mj_model: mujoco.MjModel, size: int) -> mujoco.MjModel:
-    """Set options of MuJoCo's renderer, in place: fine polygons, no multisampling, and a large enough buffer."""
+    """Set options of MuJoCo's renderer in place, and return the model: fine polygons, no multisampling, a large buffer."""
     quality, buffer = mj_model.vis.quality, mj_model.vis.global_
     quality.numslices, quality.numstacks, quality.numquads = render_models.SLICES, render_models.STACKS, render_models.QUADS
     quality.offsamples = 0

@@ -26,7 +26,7 @@ if __name__ == "__main__" and version("jaxlib").startswith("0.10."):  # brax com
 
 from benchmarks.ledger.records import RESULTS  # noqa: E402
 from benchmarks.pixels.training_tasks import IMAGE_SIZE, SMOKE, TASKS, Task  # noqa: E402
-from jaxrl_vis.bench.conditions import Watch  # noqa: E402
+from jaxrl_vis.bench.conditions import ConditionMonitor  # noqa: E402
 from jaxrl_vis.bench.record import Measurement, compare_and_keep  # noqa: E402
 from jaxrl_vis.errors import RequestError  # noqa: E402
 from jaxrl_vis_envs.adapters.brax import share_jax_with_brax  # noqa: E402
@@ -110,14 +110,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise RequestError(
                 f"--envs must be a divisor of {batch} (minibatches times their size), got {settings['num_envs']}"
             )
-        watch = None if options.smoke else Watch()
+        monitor = None if options.smoke else ConditionMonitor()
         evaluations = train(task, settings, options.seed)
     except RequestError as error:
         print(error, file=sys.stderr)
         return 2
-    if watch is not None:
+    if monitor is not None:
         for measurement in measurements(options.task, evaluations, settings, options.seed):
-            compare_and_keep("pixels", measurement, options.results, watch.conditions())
+            compare_and_keep("pixels", measurement, options.results, monitor.conditions())
     return 0
 
 

@@ -29,16 +29,16 @@ class Task:
     """Trainable task.
 
     Attributes:
-        make: Creates the environment, with images as its only observation.
-        wrapper: Returns the function that wraps the environment for brax's trainers.
+        make: Function that creates the environment, with images as its only observation.
+        wrapper: Function that returns the function that wraps the environment for brax's trainers.
         settings: Arguments of brax's trainer.
         networks: Arguments of brax's networks.
         measure: Name of the score.
-        score: Computes the score from the metrics of brax's evaluation.
+        score: Function from the metrics of brax's evaluation to the score.
         unit: Unit of the score.
         target: Score up to which a run is timed.
         inputs: Description of an observation, for the records.
-        make_evaluated: Creates the environment of evaluations; None for that of training.
+        make_evaluated: Function that creates the environment of evaluations; None for that of training.
     """
 
     make: Callable[[], pixels.PixelEnv]

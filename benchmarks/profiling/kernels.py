@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis import preset
-from jaxrl_vis.bench.update import seed_keys, start
+from jaxrl_vis.bench.update import init_with_full_replay, seed_keys
 from jaxrl_vis.config import Config, fields
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
@@ -79,9 +79,9 @@ def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: 
 
 
 def measure(program: TrainStep, options: argparse.Namespace) -> None:
-    """Compile the parts and report each."""
+    """Compile the parts in ``options.parts`` for a program with a replay full of noise, and print a report of each."""
     parts: list[str] = options.parts
-    loop, keys = start(program), seed_keys(program, 2)
+    loop, keys = init_with_full_replay(program), seed_keys(program, 2)
     train, replay, iteration = loop.train, loop.replay, jnp.zeros((), jnp.int32)
     playing = train, keys, jnp.int32(0), program.exploration
     rolled = jax.eval_shape(program.play, *playing)[0]
@@ -97,7 +97,7 @@ def measure(program: TrainStep, options: argparse.Namespace) -> None:
         with rarely_collecting_garbage():
             compiled[part] = function.lower(*inputs).compile()
 
-    def call(part: str) -> None:
+    def run_phase(part: str) -> None:
         # Donated arguments are returned, so that the next call can use them.
         nonlocal train, replay
         if part == "update":
@@ -113,7 +113,7 @@ def measure(program: TrainStep, options: argparse.Namespace) -> None:
         _, _, turns, what = arguments[part]
         report(
             f"{what} of {program.config.run.seeds} learners",
-            lambda part=part: call(part),
+            lambda part=part: run_phase(part),
             turns,
             options.rows,
             options.in_order,

@@ -76,7 +76,7 @@ def count_launches(program: str) -> tuple[Counts, Counts, int]:
 
 
 def control_step(name: str, episodes: int) -> str:
-    """Return the optimized HLO of a control step of a task with the MJX engine."""
+    """Return the optimized HLO text of a control step of ``episodes`` parallel environments of a task with the MJX engine."""
     env: Any = environments.make(name)
     keys = jax.random.split(jax.random.key(0), episodes)
     state, action = jax.eval_shape(lambda: (jax.vmap(env.reset)(keys), jax.numpy.zeros((episodes, env.action_size))))

@@ -59,7 +59,12 @@ class Problem:
         return {"critic": self.networks.init_critic(critic_key), "heads": heads}
 
     def batches(self, key: jax.Array, count: int) -> dict[str, jax.Array]:
-        """Draw ``count`` batches of images [count, 2, B, C, H, W] uint8, actions, values and targets."""
+        """Sample ``count`` batches.
+
+        Returns:
+            ``images`` [count, 2, B, C, H, W] uint8, ``action`` [count, B, A] float32 in [-1, 1], ``value`` [count, B] float32,
+            and ``targets`` [count, L, B, TARGETS] float32 of L auxiliary losses.
+        """
         image_key, action_key, value_key, target_key = jax.random.split(key, 4)
         shape = self.networks.observation_spec.shape
         draw = functools.partial(jax.random.normal, shape=(count, self.size))
@@ -71,14 +76,25 @@ class Problem:
         }
 
     def encode(self, encoder: Any, batch: dict[str, jax.Array]) -> jax.Array:
-        """Encode the images before and after the action to latents [2, B, latent]."""
+        """Encode the images before and after the action to latents [2, B, latent].
+
+        Args:
+            encoder: Parameters of the encoder.
+            batch: One batch of `batches`.
+        """
         mean, scale = (jnp.full(self.networks.observation_spec.shape, value) for value in (127.5, 1 / 74.0))
         images = batch["images"].reshape(2 * self.size, *self.networks.observation_spec.shape)
         inputs = self.networks.prepare(Scaling(mean, scale), images)
         return self.networks.encode({"encoder": encoder}, inputs).reshape(2, self.size, -1)
 
     def losses(self, params: Any, latents: jax.Array, batch: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        """Compute the main loss and each auxiliary loss, by name."""
+        """Compute the main loss and each auxiliary loss, [] float32 by name: mean squared errors of value and targets.
+
+        Args:
+            params: Parameters as from `params`.
+            latents: [2, B, latent], before and after the action.
+            batch: One batch of `batches`.
+        """
         value = self.networks.value(params["critic"], latents, batch["action"])
         both = jnp.concatenate([latents[0], latents[1]], axis=-1).astype(jnp.bfloat16)
         losses = {MAIN: jnp.mean(jnp.square(value - batch["value"]))}
@@ -88,7 +104,12 @@ class Problem:
         return losses
 
     def make_steps(self, weighting: Weighting, mode: Any) -> Any:
-        """Return the jitted function (params, weighting's state, batches) -> both after `STEPS` updates, and the weights."""
+        """Return the jitted function (params, weighting's state, batches) -> both after `STEPS` updates, and the weights.
+
+        Args:
+            weighting: Weighting of the losses.
+            mode: Differentiation mode of `weighted_grad`.
+        """
         find = weighted_grad(
             self.losses,
             weighting,

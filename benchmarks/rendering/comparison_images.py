@@ -31,7 +31,7 @@ GAIN = 8  # amplification of the difference
 MISSING = (255, 225, 225)
 
 
-def write_sheets() -> dict[str, list[str]]:
+def models_by_sheet() -> dict[str, list[str]]:
     """Return the models by sheet: one sheet per group of features, one of limits, one of our and public models."""
     groups: dict[str, list[str]] = {}
     for name in FEATURES:
@@ -105,11 +105,11 @@ def sheet(names: list[str], columns: int = 2) -> Image.Image:
 def main() -> None:
     """Create the named sheets, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sheets", nargs="*", metavar="SHEET", help=f"all if none is named: {', '.join(write_sheets())}")
+    parser.add_argument("sheets", nargs="*", metavar="SHEET", help=f"all if none is named: {', '.join(models_by_sheet())}")
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for name in parser.parse_args().write_sheets or write_sheets():
+    for name in parser.parse_args().sheets or models_by_sheet():
         path = FOLDER / f"{name}.png"
-        sheet(write_sheets()[name]).save(path, optimize=True)
+        sheet(models_by_sheet()[name]).save(path, optimize=True)
         print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1000:.0f} kB", flush=True)
 
 

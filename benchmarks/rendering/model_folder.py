@@ -73,7 +73,7 @@ class Measures:
         }
         return [name for name, holds in held.items() if not holds]
 
-    def worse(self, other: "Measures") -> "Measures":
+    def worst_of(self, other: "Measures") -> "Measures":
         """Return the elementwise worse of two measures."""
         similarities, differences = ("segmentation", "depth", "matched"), ("rgb", "max_difference", "large_differences")
         values: dict[str, Any] = {name: min(getattr(self, name), getattr(other, name)) for name in similarities}
@@ -188,15 +188,20 @@ class Comparison:
                 pass
         return [render_models.poses_of(data) for data in self.data]
 
-    def lens(self, view: View) -> tuple[int, int]:
-        """Return height and width, in the aspect ratio of the camera's resolution."""
+    def image_size(self, view: View) -> tuple[int, int]:
+        """Return height and width of a view's images, pixels, in the aspect ratio of the camera's resolution."""
         wide, high = (1, 1) if view.camera is None else self.mj_model.cam_resolution[view.camera]
         scale = self.size / max(wide, high)
         return max(1, round(high * scale)), max(1, round(wide * scale))
 
     def compare(self, view: View, pictures: pathlib.Path | None = None) -> tuple[Measures | None, str]:
-        """Compare a view; return its measures (None if our renderer refuses the model) and the verdict."""
-        height, width = self.lens(view)
+        """Compare a view in all poses; return its measures (None if our renderer refuses the model) and the verdict.
+
+        Args:
+            view: Camera and features to render.
+            pictures: Prefix of the PNG files for ours, MuJoCo's and the difference times 8, side by side; None for no files.
+        """
+        height, width = self.image_size(view)
         groups = (0, 1, 2) if view.sites else ()
         options: dict[str, Any] = dict(site_groups=groups, haze=view.haze, lights="mujoco")
         remark = ""
@@ -221,7 +226,7 @@ class Comparison:
                 if measures.failures() and np.any(hidden):
                     measures = measure(our, their, hidden)
                     remark += f", without {limit} (limit)" if limit not in remark else ""
-            total = total.worse(measures)
+            total = total.worst_of(measures)
         if pictures is not None:
             for number, (our, their) in enumerate(zip(ours, theirs, strict=True)):
                 difference = np.minimum(8 * np.abs(our.rgb.astype(np.int16) - their.rgb), 255).astype(np.uint8)
@@ -231,12 +236,12 @@ class Comparison:
         failures = total.failures()
         if not failures:
             return total, "pass" + remark
-        doubt = self.doubt(view, scene, ours, theirs)
+        doubt = self.reference_fault(view, scene, ours, theirs)
         return total, f"no verdict: {doubt}" if doubt else "**FAIL**: " + ", ".join(failures) + remark
 
     def reference(self, view: View, shift: np.ndarray | float = 0.0) -> list[Frame]:
-        """Render all poses by MuJoCo, with the camera moved by ``shift`` [3] (m)."""
-        height, width = self.lens(view)
+        """Render all poses with MuJoCo's renderer, with the camera moved by ``shift`` [3] (m, world axes)."""
+        height, width = self.image_size(view)
         frames = []
         groups = (0, 1, 2) if view.sites else ()
         with ReferenceRenderer(self.mj_model, height, width, site_groups=groups, haze=view.haze) as renderer:
@@ -253,7 +258,7 @@ class Comparison:
                 data.cam_xpos[camera] -= shift
         return frames
 
-    def doubt(self, view: View, scene: Scene, ours: list[Frame], theirs: list[Frame]) -> str:
+    def reference_fault(self, view: View, scene: Scene, ours: list[Frame], theirs: list[Frame]) -> str:
         """Return why MuJoCo's images are not a valid reference; an empty string if they are."""
         nowhere = np.zeros(theirs[0].segmentation.shape, bool)
         for direction in ([0.3, 0.5, 0.8], [-0.7, 0.2, 0.1]):

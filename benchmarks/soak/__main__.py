@@ -29,7 +29,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.soak.goodput import killed_every, report, undisturbed
+from benchmarks.soak.goodput import report, train_undisturbed, train_with_kills
 from benchmarks.soak.record import Record
 from benchmarks.soak.soak import Soak
 
@@ -42,7 +42,7 @@ def _soak(options: argparse.Namespace, folder: Path) -> int:
             record.write(options.json)
 
     soak = Soak(folder, options.faults, options.seed, 60.0 * options.minutes - _TO_THE_END, note)
-    soak.undisturbed()
+    soak.train_reference()
     with concurrent.futures.ThreadPoolExecutor(options.workers) as pool:
         for future in [pool.submit(soak.work, worker) for worker in range(options.workers)]:
             future.result()
@@ -53,8 +53,8 @@ def _soak(options: argparse.Namespace, folder: Path) -> int:
 
 def _goodput(options: argparse.Namespace, folder: Path) -> int:
     what = [options.env, "--preset", options.preset, "--seed", str(options.seed)]
-    killed = killed_every(folder / "killed", options.sigkill_every, options.minutes, what)
-    reference = None if options.no_reference else undisturbed(folder / "undisturbed", killed["env_steps"], what)
+    killed = train_with_kills(folder / "killed", options.sigkill_every, options.minutes, what)
+    reference = None if options.no_reference else train_undisturbed(folder / "undisturbed", killed["env_steps"], what)
     figures = report(killed, options.sigkill_every, reference)
     if options.json is not None:
         options.json.write_text(json.dumps(Record(seed=options.seed).machine | figures, indent=1) + "\n")

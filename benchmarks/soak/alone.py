@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.soak.parts import Broken, Part, killed_afterwards, list_checkpoints, read_rows
+from benchmarks.soak.parts import Broken, RunProcess, kill_on_exit, list_checkpoints, read_rows
 
 TASK = """
 import dataclasses
@@ -63,17 +63,17 @@ FEW_TO_GRASP = {
 _CLI = (sys.executable, "-m", "jaxrl_vis")
 
 
-def _command(words: Sequence[str], folder: Path, **variables: str) -> Part:
-    return Part.command([*_CLI, *words], folder, variables)
+def _start_command(arguments: Sequence[str], folder: Path, **variables: str) -> RunProcess:
+    return RunProcess.start_command([*_CLI, *arguments], folder, variables)
 
 
-def _wait_until_finished(part: Part, *statuses: int) -> Part:
-    with killed_afterwards(part):
-        status = part.end()
-    part.check_words()
+def _wait_until_finished(process: RunProcess, *statuses: int) -> RunProcess:
+    with kill_on_exit(process):
+        status = process.wait()
+    process.check_output()
     if status not in statuses:
-        raise Broken(f"ended with {status}, not {statuses}: {part.lines[-6:]}")
-    return part
+        raise Broken(f"ended with {status}, not {statuses}: {process.lines[-6:]}")
+    return process
 
 
 def nan_on_one_seed(folder: Path, rng: random.Random, _: "References") -> None:
@@ -83,9 +83,9 @@ def nan_on_one_seed(folder: Path, rng: random.Random, _: "References") -> None:
     run, steps = folder / "run", 4 * 50
     options = ["broken_task:BrokenReach", "--env-folder", str(folder), "--preset", "debug", "--seeds", "2"]
     options += ["--env-steps", str(400 * steps), "--seed", str(rng.randrange(10**6)), "--checkpoint-interval", "3"]
-    part = Part.start(run, {"SOAK_NAN": str(1.0 / rng.uniform(100, 800))}, options)
-    _wait_until_finished(part, 4)
-    (line,) = [line for line in part.lines if "non-finite" in line]
+    process = RunProcess.start(run, {"SOAK_NAN": str(1.0 / rng.uniform(100, 800))}, options)
+    _wait_until_finished(process, 4)
+    (line,) = [line for line in process.lines if "non-finite" in line]
     seeds = re.search(r"seeds? ([\d, ]+)", line)
     if seeds is None or "," in seeds.group(1):
         raise Broken(f"not one seed is named: {line}")
@@ -95,14 +95,14 @@ def nan_on_one_seed(folder: Path, rng: random.Random, _: "References") -> None:
     if not saved:
         return  # in the very first iterations there is nothing to resume from, which the line reports
     rows = read_rows(run)
-    again = _wait_until_finished(Part.start(run, None, ["--env-steps", str((saved[-1][0] + 6) * steps)]), 0)
+    again = _wait_until_finished(RunProcess.start(run, None, ["--env-steps", str((saved[-1][0] + 6) * steps)]), 0)
     if not again.count("resumed at iteration"):
         raise Broken(f"it did not go on from the last good checkpoint: {again.lines}")
     if [row for row in read_rows(run) if row in rows] != rows:
         raise Broken("rows were lost")
 
 
-def _children(process: int) -> list[int]:
+def _list_descendants(process: int) -> list[int]:
     """List all descendants of a process."""
     processes = []
     for task in Path(f"/proc/{process}/task").glob("*/children"):
@@ -110,27 +110,35 @@ def _children(process: int) -> list[int]:
             own = [int(word) for word in task.read_text().split()]
         except OSError:
             continue
-        processes += own + [other for child in own for other in _children(child)]
+        processes += own + [other for child in own for other in _list_descendants(child)]
     return processes
 
 
-def _is(process: int, words: str) -> bool:
+def _has_command(process: int, command: str) -> bool:
     try:
-        return words.encode() in Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ")
+        return command.encode() in Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ")
     except OSError:
         return False
 
 
-def _kill_a_worker(part: Part, words: str, rng: random.Random, delay: float, is_ready: Callable[[], bool]) -> bool:
-    """Kill a descendant of a part whose command line contains ``words``, after a random delay; return True if there was one."""
+def _kill_a_worker(process: RunProcess, command: str, rng: random.Random, delay: float, is_ready: Callable[[], bool]) -> bool:
+    """Kill a descendant of a process after a random delay; return True if there was one.
+
+    Args:
+        process: The process.
+        command: Text that the command line of the descendant must contain.
+        rng: Source of the delay and of the choice among several.
+        delay: Maximum delay, s, once there is such a descendant and ``is_ready`` returns True.
+        is_ready: Function that returns True when the descendant may be killed.
+    """
 
     def workers() -> list[int]:
-        return [process for process in _children(part.process.pid) if _is(process, words)]
+        return [pid for pid in _list_descendants(process.popen.pid) if _has_command(pid, command)]
 
-    part.wait_for(lambda: bool(workers()) and is_ready())
+    process.wait_for(lambda: bool(workers()) and is_ready())
     time.sleep(rng.uniform(0.0, delay))
     running = workers()
-    if not running or not part.runs():
+    if not running or not process.is_running():
         return False
     try:
         os.kill(rng.choice(running), signal.SIGKILL)
@@ -139,34 +147,34 @@ def _kill_a_worker(part: Part, words: str, rng: random.Random, delay: float, is_
     return True
 
 
-def _parse_single_line(part: Part, words: str) -> None:
-    if sum(words in line for line in part.lines) != 1:
-        raise Broken(f"not one line says {words!r}: {part.lines[-8:]}")
+def _check_single_line(process: RunProcess, text: str) -> None:
+    if sum(text in line for line in process.lines) != 1:
+        raise Broken(f"not one line says {text!r}: {process.lines[-8:]}")
 
 
 def worker_of_a_study(folder: Path, rng: random.Random, references: "References", executor: Sequence[str] = ()) -> None:
     """Kill one of two cells: the other continues, and the next start finishes both, with the rows of undisturbed ones."""
-    words = _sweep(folder, executor)
-    part = _command(words, folder)
-    with killed_afterwards(part):
+    words = _sweep_arguments(folder, executor)
+    process = _start_command(words, folder)
+    with kill_on_exit(process):
         cells = folder / "runs"
-        struck = _kill_a_worker(part, "jaxrl_vis train", rng, 1.0, lambda: bool(list(cells.glob("*/checkpoints"))))
-        part.end()
-    part.check_words()
+        struck = _kill_a_worker(process, "jaxrl_vis train", rng, 1.0, lambda: bool(list(cells.glob("*/checkpoints"))))
+        process.wait()
+    process.check_output()
     if struck:
-        if part.process.returncode == 0:
+        if process.popen.returncode == 0:
             raise NotStruck
-        if part.process.returncode not in (1, 3):
-            raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
-        _parse_single_line(part, "failed with exit status")
-    _wait_until_finished(_command(words, folder), 0)
+        if process.popen.returncode not in (1, 3):
+            raise Broken(f"ended with {process.popen.returncode}: {process.lines[-5:]}")
+        _check_single_line(process, "failed with exit status")
+    _wait_until_finished(_start_command(words, folder), 0)
     if _cell_rows(folder) != references.study():
-        raise Broken(f"rows differ from those of an undisturbed study: {part.lines}")
+        raise Broken(f"rows differ from those of an undisturbed study: {process.lines}")
     if not struck:
         raise NotStruck
 
 
-def _sweep(folder: Path, executor: Sequence[str] = ()) -> list[str]:
+def _sweep_arguments(folder: Path, executor: Sequence[str] = ()) -> list[str]:
     words = ["sweep", "Reacher", "--preset", "debug", "--seeds", "2", "--seeds-per-run", "1", "--env-steps", "24000"]
     return [*words, "--updates-per-iteration", "20", "--eval-interval", "20", "--runs", str(folder / "runs"), *executor]
 
@@ -180,7 +188,7 @@ def job_of_a_study(folder: Path, rng: random.Random, references: "References") -
     worker_of_a_study(folder, rng, references, ("--executor", "local"))
 
 
-def _phenotype(folder: Path, plots: Path) -> list[str]:
+def _phenotype_arguments(folder: Path, plots: Path) -> list[str]:
     return ["phenotype", "run", str(plots), "--out", str(folder / "out"), "--masks", "truth", "--workers", "2"]
 
 
@@ -191,12 +199,12 @@ def _tables(out: Path) -> dict[str, bytes]:
 def worker_of_phenotyping(folder: Path, rng: random.Random, references: "References") -> None:
     """Kill a worker of ``phenotype run``; the next start writes the same tables."""
     plots, tables = references.phenotyping()
-    _pool(_phenotype(folder, plots), folder, rng)
+    _check_pool(_phenotype_arguments(folder, plots), folder, rng)
     if _tables(folder / "out") != tables:
         raise Broken("tables differ from those of an undisturbed run")
 
 
-def _grasp(folder: Path, spec: Path) -> list[str]:
+def _grasp_arguments(folder: Path, spec: Path) -> list[str]:
     words = ["grasp", "eval", "--masks", "truth", "--width", "256", "--frames", "3", "--runs", "3", "--spec", str(spec)]
     return [*words, "--workers", "2", "--json", str(folder / "eval.json")]
 
@@ -212,7 +220,7 @@ def _figures(file: Path) -> list[dict[str, Any]]:
 def worker_of_grasping(folder: Path, rng: random.Random, references: "References") -> None:
     """Kill a worker of ``grasp eval``; the next start gives the same figures."""
     spec, figures = references.grasping()
-    _pool(_grasp(folder, spec), folder, rng)
+    _check_pool(_grasp_arguments(folder, spec), folder, rng)
     if _figures(folder / "eval.json") != figures:
         raise Broken("figures differ from those of an undisturbed evaluation")
 
@@ -221,21 +229,21 @@ class NotStruck(Exception):
     """The command finished before the fault."""
 
 
-def _pool(words: Sequence[str], folder: Path, rng: random.Random) -> None:
+def _check_pool(arguments: Sequence[str], folder: Path, rng: random.Random) -> None:
     """Kill a worker of a pool, and check that the same command finishes when started again."""
     folder.mkdir(exist_ok=True)
-    part = _command(words, folder)
-    with killed_afterwards(part):
-        struck = _kill_a_worker(part, "spawn_main", rng, 4.0, lambda: True)
-        part.end()
-    part.check_words()
-    if struck and part.process.returncode == 0:
+    process = _start_command(arguments, folder)
+    with kill_on_exit(process):
+        struck = _kill_a_worker(process, "spawn_main", rng, 4.0, lambda: True)
+        process.wait()
+    process.check_output()
+    if struck and process.popen.returncode == 0:
         raise NotStruck  # the worker had finished its work
     if struck:
-        if part.process.returncode not in (1, 2):
-            raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
-        _parse_single_line(part, "processes was killed from outside")
-    _wait_until_finished(_command(words, folder), 0)
+        if process.popen.returncode not in (1, 2):
+            raise Broken(f"ended with {process.popen.returncode}: {process.lines[-5:]}")
+        _check_single_line(process, "processes was killed from outside")
+    _wait_until_finished(_start_command(arguments, folder), 0)
     if not struck:
         raise NotStruck
 
@@ -251,7 +259,7 @@ class References:
         self._folder, self._lock = folder, threading.Lock()
         self._made: dict[str, Any] = {}
 
-    def _once(self, name: str, make: Callable[[Path], Any]) -> Any:
+    def _compute_once(self, name: str, make: Callable[[Path], Any]) -> Any:
         with self._lock:
             if name not in self._made:
                 (self._folder / name).mkdir(parents=True)
@@ -259,41 +267,47 @@ class References:
             return self._made[name]
 
     def study(self) -> dict[str, list]:
-        """Return rows by name of the cell."""
+        """Return the rows of each run of a sweep by the name of its cell."""
 
         def make(folder: Path) -> dict[str, list]:
-            _wait_until_finished(_command(_sweep(folder), folder), 0)
+            _wait_until_finished(_start_command(_sweep_arguments(folder), folder), 0)
             return _cell_rows(folder)
 
-        return self._once("study", make)
+        return self._compute_once("study", make)
 
     def phenotyping(self) -> tuple[Path, dict[str, bytes]]:
-        """Return the folder of plots, and their tables."""
+        """Return the folder of plots, and the contents of their tables by file name."""
 
         def make(folder: Path) -> tuple[Path, dict[str, bytes]]:
             (folder / "few.json").write_text(json.dumps(FEW_STALKS))
             words = ["phenotype", "synth", str(folder / "plots"), "--spec", str(folder / "few.json"), "--width", "422"]
-            _wait_until_finished(_command([*words, "--frames", "4", "--plots", "2"], folder), 0)
-            _wait_until_finished(_command(_phenotype(folder, folder / "plots"), folder), 0)
+            _wait_until_finished(_start_command([*words, "--frames", "4", "--plots", "2"], folder), 0)
+            _wait_until_finished(_start_command(_phenotype_arguments(folder, folder / "plots"), folder), 0)
             return folder / "plots", _tables(folder / "out")
 
-        return self._once("phenotyping", make)
+        return self._compute_once("phenotyping", make)
 
     def grasping(self) -> tuple[Path, list]:
-        """Return the file of a family, and the figures of its runs."""
+        """Return the file of a family, and the results of its runs without durations."""
 
         def make(folder: Path) -> tuple[Path, list]:
             spec = folder / "few.json"
             spec.write_text(json.dumps(FEW_TO_GRASP))
-            _wait_until_finished(_command(_grasp(folder, spec), folder), 0)
+            _wait_until_finished(_start_command(_grasp_arguments(folder, spec), folder), 0)
             return spec, _figures(folder / "eval.json")
 
-        return self._once("grasping", make)
+        return self._compute_once("grasping", make)
 
 
 @dataclasses.dataclass(frozen=True)
 class Alone:
-    """Fault with a folder of its own; see the module."""
+    """Fault with a folder of its own.
+
+    Attributes:
+        strike: Function of the folder to create, a random generator and the references that injects the fault and checks the
+            outcome; see the module.
+        guarantee: Guaranteed outcome, for the table.
+    """
 
     strike: Callable[[Path, random.Random, References], None]
     guarantee: str
@@ -315,7 +329,11 @@ ALONE: dict[str, Alone] = {
 
 
 def strike_alone(name: str, folder: Path, rng: random.Random, references: References) -> bool:
-    """Inject a fault of `ALONE` in a new folder; return False if the command finished first."""
+    """Inject a fault of `ALONE` in a new folder, which is then deleted; return False if the command finished first.
+
+    Raises:
+        Broken: The command does not handle the fault; the folder is left.
+    """
     try:
         ALONE[name].strike(folder, rng, references)
     except NotStruck:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.soak.disks import freezing_disk, small_disk
-from benchmarks.soak.parts import Broken, Part, environment, killed_afterwards, list_checkpoints, read_rows
+from benchmarks.soak.parts import Broken, RunProcess, environment, kill_on_exit, list_checkpoints, read_rows
 
 SITE = Path(__file__).with_name("site")
 Strike = Callable[[Path, random.Random], int | None]
@@ -47,88 +47,88 @@ class Fault:
 
 def _start_run(
     folder: Path, rng: random.Random, variables: dict[str, str] | None = None, file_bytes: int | None = None
-) -> Part:
+) -> RunProcess:
     """Start a process and return it at a random moment of training, or after its end if it finished first.
 
     Raises:
         Broken: Training did not begin.
     """
-    part = Part.start(folder, variables, file_bytes=file_bytes)
-    if not part.wait_for(part.is_training) and (part.runs() or part.end() != 0):
-        with killed_afterwards(part):
-            raise Broken(f"it did not begin to train: {part.lines[-4:]}")
+    process = RunProcess.start(folder, variables, file_bytes=file_bytes)
+    if not process.wait_for(process.is_training) and (process.is_running() or process.wait() != 0):
+        with kill_on_exit(process):
+            raise Broken(f"it did not begin to train: {process.lines[-4:]}")
     time.sleep(rng.uniform(0.0, 0.8))
-    return part
+    return process
 
 
 def _send_signal(*numbers: int, to_group: bool = False) -> Strike:
     def strike(folder: Path, rng: random.Random) -> int | None:
-        with killed_afterwards(_start_run(folder, rng)) as part:
+        with kill_on_exit(_start_run(folder, rng)) as process:
             for number in numbers:
-                if not part.runs():
+                if not process.is_running():
                     break
                 with contextlib.suppress(ProcessLookupError):
-                    (os.killpg if to_group else os.kill)(part.process.pid, number)
+                    (os.killpg if to_group else os.kill)(process.popen.pid, number)
                 time.sleep(rng.uniform(0.0, 0.3) if len(numbers) > 1 else 0.0)
-            return _wait_for_end(part)
+            return _wait_for_end(process)
 
     return strike
 
 
-def _wait_for_end(part: Part) -> int | None:
-    status = part.end()
-    part.check_words()
+def _wait_for_end(process: RunProcess) -> int | None:
+    status = process.wait()
+    process.check_output()
     return status or None
 
 
 def _kill_during_a_save(folder: Path, rng: random.Random) -> int | None:
-    with killed_afterwards(_start_run(folder, rng)) as part:
-        part.wait_for(part.is_saving, 20.0)
-        return part.send(signal.SIGKILL) or None
+    with kill_on_exit(_start_run(folder, rng)) as process:
+        process.wait_for(process.is_saving, 20.0)
+        return process.send(signal.SIGKILL) or None
 
 
 def _second_process(folder: Path, rng: random.Random) -> int | None:
-    with killed_afterwards(Part.start(folder)) as part:
+    with kill_on_exit(RunProcess.start(folder)) as process:
         # Another process takes seconds to start; the first holds the folder from before it compiles.
-        part.wait_for(part.is_compiling)
+        process.wait_for(process.is_compiling)
         rows = read_rows(folder)
-        with killed_afterwards(Part.start(folder)) as other:
-            status = other.end()
-            other.check_words()
-        if not part.runs():
-            return part.end() or None
+        with kill_on_exit(RunProcess.start(folder)) as other:
+            status = other.wait()
+            other.check_output()
+        if not process.is_running():
+            return process.wait() or None
         if status != 2 or other.count("in use by process") != 1:
             raise Broken(f"a second process ended with {status}: {other.lines[-3:]}")
         if read_rows(folder)[: len(rows)] != rows:
             raise Broken("a second process changed the rows of the first")
-        part.wait_for(part.is_training)
-        return part.stop() or None
+        process.wait_for(process.is_training)
+        return process.stop() or None
 
 
 def _full_disk(folder: Path, rng: random.Random) -> int | None:
     """Fill the disk, including any space freed on it; if no disk can be mounted, limit the size of files instead."""
     with small_disk(folder) as (place, fill):
         limit = None if fill() and (place.parent / "other").unlink() is None else 100_000
-        with killed_afterwards(_start_run(place, rng, file_bytes=limit)) as part:
-            while part.runs() and limit is None:
+        with kill_on_exit(_start_run(place, rng, file_bytes=limit)) as process:
+            while process.is_running() and limit is None:
                 fill()
                 time.sleep(0.05)
-            return _wait_for_end(part)
+            return _wait_for_end(process)
 
 
 def _stalled_disk(folder: Path, rng: random.Random) -> int | None:
-    with freezing_disk(folder) as (place, freeze), killed_afterwards(_start_run(place, rng)) as part:
+    with freezing_disk(folder) as (place, freeze), kill_on_exit(_start_run(place, rng)) as process:
         still = rng.uniform(1.0, 4.0)
-        part.wait_for(part.is_saving, 5.0)
+        process.wait_for(process.is_saving, 5.0)
         if freeze(True):
             time.sleep(still)
             freeze(False)
-        elif part.runs():
-            part.process.send_signal(signal.SIGSTOP)
+        elif process.is_running():
+            process.popen.send_signal(signal.SIGSTOP)
             time.sleep(still)
-            part.process.send_signal(signal.SIGCONT)
+            process.popen.send_signal(signal.SIGCONT)
         time.sleep(0.5)
-        return part.stop() or None
+        return process.stop() or None
 
 
 def _with_site(**variables: str) -> dict[str, str]:
@@ -140,12 +140,12 @@ def _jumping_clock(folder: Path, rng: random.Random) -> int | None:
     clock = folder.with_name(f"{folder.name}.clock")
     clock.unlink(missing_ok=True)
     variables = _with_site(SOAK_CLOCK=str(clock))
-    with killed_afterwards(_start_run(folder, rng, variables)) as part:
+    with kill_on_exit(_start_run(folder, rng, variables)) as process:
         for _ in range(3):
             clock.write_text(str(rng.choice((-1, 1)) * rng.uniform(60.0, 30 * 86400.0)))
             time.sleep(rng.uniform(0.1, 0.5))
-        status = part.stop()
-        part.check_words()
+        status = process.stop()
+        process.check_output()
         file = folder / "metrics.jsonl"
         rows = [json.loads(line) for line in (file.read_text() if file.exists() else "").splitlines()]
         # An earlier fault may have flipped a bit of the name.
@@ -157,19 +157,23 @@ def _jumping_clock(folder: Path, rng: random.Random) -> int | None:
 
 def _kill_run(folder: Path, rng: random.Random) -> bool:
     """Send SIGKILL during training; return True if the run had not finished and has a checkpoint."""
-    with killed_afterwards(_start_run(folder, rng)) as part:
-        part.wait_for(lambda: len(list_checkpoints(folder)) > 1, 20.0)
-        return part.send(signal.SIGKILL) != 0 and bool(list_checkpoints(folder))
+    with kill_on_exit(_start_run(folder, rng)) as process:
+        process.wait_for(lambda: len(list_checkpoints(folder)) > 1, 20.0)
+        return process.send(signal.SIGKILL) != 0 and bool(list_checkpoints(folder))
 
 
-def _resume_run(folder: Path, rng: random.Random, variables: dict[str, str] | None = None) -> tuple[int, Part]:
-    """Resume, and stop again during training; return the exit status and the process."""
-    with killed_afterwards(_start_run(folder, rng, variables)) as part:
-        status = part.stop()
-        part.check_words()
+def _resume_run(folder: Path, rng: random.Random, variables: dict[str, str] | None = None) -> tuple[int, RunProcess]:
+    """Resume, and stop again during training; return the exit status and the process.
+
+    Raises:
+        Broken: The exit status is neither 0 nor 143, or a traceback was printed.
+    """
+    with kill_on_exit(_start_run(folder, rng, variables)) as process:
+        status = process.stop()
+        process.check_output()
         if status not in (0, 143):
-            raise Broken(f"resumed, it ended with {status}: {part.lines[-4:]}")
-        return status, part
+            raise Broken(f"resumed, it ended with {status}: {process.lines[-4:]}")
+        return status, process
 
 
 def _check_went_back(
@@ -182,6 +186,9 @@ def _check_went_back(
         before: Its rows before it was resumed.
         all_before: Its checkpoints before it was resumed.
         intact: The undamaged ones among ``all_before``.
+
+    Raises:
+        Broken: The newest checkpoint is older than the newest intact one, or rows were lost.
     """
     newest, newest_good, last = (
         max((iteration for iteration, *_ in checkpoints), default=0)
@@ -208,9 +215,9 @@ def _damage_checkpoint(folder: Path, rng: random.Random) -> int | None:
             shutil.rmtree(path / ("manifest" if how == "no manifest" else "train"))
     else:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    status, part = _resume_run(folder, rng)
-    if part.count(f"checkpoint {tier}/") != 1 or part.count("is damaged") != 1:
-        raise Broken(f"nothing was said about a damaged checkpoint: {part.lines}")
+    status, process = _resume_run(folder, rng)
+    if process.count(f"checkpoint {tier}/") != 1 or process.count("is damaged") != 1:
+        raise Broken(f"nothing was said about a damaged checkpoint: {process.lines}")
     _check_went_back(folder, rows, there, good)
     return status or None
 
@@ -248,16 +255,16 @@ def _bit_in_metrics(folder: Path, rng: random.Random) -> int | None:
     number = file.read_bytes()[:place].count(b"\n")
     row = file.read_bytes().splitlines()[number] if number < len(file.read_bytes().splitlines()) else b""
     done = max((iteration for iteration, *_ in list_checkpoints(folder)), default=0)
-    status, part = _resume_run(folder, rng)
+    status, process = _resume_run(folder, rng)
     # The row of that line may be lost, and the next one if the line break was hit; all others are kept.
     others = [old for i, old in enumerate(before) if i not in (number, number + 1) and old["iteration"] <= done]
     if missing := [old["iteration"] for old in others if old not in read_rows(folder)]:
-        raise Broken(f"rows {missing} were lost with row {number}: {part.lines}")
+        raise Broken(f"rows {missing} were lost with row {number}: {process.lines}")
     try:
         json.loads(row)
     except ValueError:
-        if not part.count("metrics.jsonl"):
-            raise Broken(f"nothing was said about a damaged row, {row!r}: {part.lines}") from None
+        if not process.count("metrics.jsonl"):
+            raise Broken(f"nothing was said about a damaged row, {row!r}: {process.lines}") from None
     return status or None
 
 
@@ -266,17 +273,17 @@ def _move_folder(is_kept: bool) -> Strike:
 
     def strike(folder: Path, rng: random.Random) -> int | None:
         there = folder.with_name(f"{folder.name}-{'moved' if is_kept else 'trash'}")
-        with killed_afterwards(_start_run(folder, rng)) as part:
+        with kill_on_exit(_start_run(folder, rng)) as process:
             rows = read_rows(folder)
-            if not part.runs():
-                return part.end() or None
+            if not process.is_running():
+                return process.wait() or None
             folder.rename(there)
             if not is_kept:
                 shutil.rmtree(there)
-            status = part.end()
-            part.check_words()
+            status = process.wait()
+            process.check_output()
         if (folder / "checkpoints").exists():
-            raise Broken(f"half a run was left in its place: {sorted(folder.rglob('*'))[:5]}; {part.lines[-2:]}")
+            raise Broken(f"half a run was left in its place: {sorted(folder.rglob('*'))[:5]}; {process.lines[-2:]}")
         if folder.exists():
             shutil.rmtree(folder)
         if is_kept:
@@ -292,8 +299,8 @@ def _stale_lock(folder: Path, rng: random.Random) -> int | None:
     """Leave the lock of a dead process. Without file locks a lease must expire, which takes a minute: rarely tried."""
     no_locks = rng.random() < 0.15
     variables = _with_site(SOAK_NO_LOCKS="1") if no_locks else _with_site()
-    with killed_afterwards(_start_run(folder, rng, variables)) as part:
-        if part.send(signal.SIGKILL) == 0:
+    with kill_on_exit(_start_run(folder, rng, variables)) as process:
+        if process.send(signal.SIGKILL) == 0:
             return None
     lock = folder / "run.lock"
     if not lock.exists():

@@ -64,17 +64,17 @@ def list_checkpoints(folder: Path) -> list[tuple[int, str, Path]]:
 
 
 @dataclasses.dataclass
-class Part:
+class RunProcess:
     """One process of a run.
 
     Attributes:
         folder: The run folder.
-        process: The process.
+        popen: The process.
         lines: Lines printed so far, stdout and stderr.
     """
 
     folder: Path
-    process: subprocess.Popen
+    popen: subprocess.Popen
     lines: list[str] = dataclasses.field(default_factory=list)
 
     @classmethod
@@ -84,7 +84,7 @@ class Part:
         variables: dict[str, str] | None = None,
         options: Sequence[str] | None = None,
         file_bytes: int | None = None,
-    ) -> "Part":
+    ) -> "RunProcess":
         """Start or resume the run in ``folder`` (`OPTIONS` by default); ``file_bytes`` limits the size of each file."""
         resume_option = ["--resume"] if folder.exists() else []
         command = [
@@ -97,13 +97,20 @@ class Part:
             str(folder),
             *resume_option,
         ]
-        return cls.command(command, folder, variables, file_bytes)
+        return cls.start_command(command, folder, variables, file_bytes)
 
     @classmethod
-    def command(
+    def start_command(
         cls, command: Sequence[str], folder: Path, variables: dict[str, str] | None = None, file_bytes: int | None = None
-    ) -> "Part":
-        """Start any command in the parent of ``folder``."""
+    ) -> "RunProcess":
+        """Start any command in the parent of ``folder``, in a session of its own.
+
+        Args:
+            command: The command.
+            folder: Run folder of the command.
+            variables: Additional environment variables.
+            file_bytes: Maximum size of a file that the process writes, bytes; None for no limit.
+        """
 
         def prepare() -> None:
             for number in (signal.SIGINT, signal.SIGHUP):  # ignored if the soak was started in the background
@@ -123,21 +130,21 @@ class Part:
         self.reader = threading.Thread(target=self._read, daemon=True)
 
     def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
+        assert self.popen.stdout is not None
+        for line in self.popen.stdout:
             self.lines.append(line.rstrip())
 
-    def end(self, seconds: float = 240.0) -> int:
+    def wait(self, seconds: float = 240.0) -> int:
         """Wait for the process and its last line; return its exit status.
 
         Raises:
             Broken: The process does not end in time; it is killed.
         """
         try:
-            status = self.process.wait(seconds)
+            status = self.popen.wait(seconds)
         except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+            self.popen.kill()
+            self.popen.wait()
             raise Broken(f"did not end within {seconds:g} s: {self.lines[-3:]}") from None
         self.reader.join(5.0)
         LAST.lines = self.lines
@@ -145,21 +152,21 @@ class Part:
 
     def send(self, number: int) -> int:
         """Send a signal and wait for the end; return the exit status."""
-        self.process.send_signal(number)
-        return self.end()
+        self.popen.send_signal(number)
+        return self.wait()
 
     def stop(self) -> int:
         """Send SIGTERM if the process still runs, and wait for its end; return the exit status."""
-        return self.send(signal.SIGTERM) if self.runs() else self.end()
+        return self.send(signal.SIGTERM) if self.is_running() else self.wait()
 
-    def runs(self) -> bool:
+    def is_running(self) -> bool:
         """Return True if the process has not ended yet."""
-        return self.process.poll() is None
+        return self.popen.poll() is None
 
     def wait_for(self, condition: Callable[[], bool], seconds: float = 180.0) -> bool:
         """Wait for a condition, at most until the process ends; return True if it holds."""
         deadline = time.monotonic() + seconds
-        while self.runs() and time.monotonic() < deadline:
+        while self.is_running() and time.monotonic() < deadline:
             if condition():
                 return True
             time.sleep(0.002)
@@ -177,11 +184,11 @@ class Part:
         """Return True if a checkpoint is being written."""
         return any("tmp" in path.name for path in self.folder.glob("checkpoints/*/*"))
 
-    def count(self, words: str) -> int:
-        """Count the printed lines that contain ``words``."""
-        return sum(words in line for line in self.lines)
+    def count(self, text: str) -> int:
+        """Count the printed lines that contain ``text``."""
+        return sum(text in line for line in self.lines)
 
-    def check_words(self) -> None:
+    def check_output(self) -> None:
         """Raise `Broken` if a traceback or a fatal error of Python was printed."""
         said = "\n".join(self.lines)
         if "Traceback" in said or "Fatal Python error" in said:
@@ -189,12 +196,12 @@ class Part:
 
 
 @contextlib.contextmanager
-def killed_afterwards(part: Part) -> Iterator[Part]:
+def kill_on_exit(process: RunProcess) -> Iterator[RunProcess]:
     """Kill the process and its group on exit, if it still runs."""
     try:
-        yield part
+        yield process
     finally:
-        if part.runs():
+        if process.is_running():
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(part.process.pid, signal.SIGKILL)
-            part.process.wait()
+                os.killpg(process.popen.pid, signal.SIGKILL)
+            process.popen.wait()

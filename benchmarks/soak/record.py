@@ -84,8 +84,8 @@ class Record:
         return "\n".join(lines) + "\n"
 
 
-def added(records: Sequence[Record]) -> Record:
-    """Add up several soaks of one commit.
+def add_records(records: Sequence[Record]) -> Record:
+    """Add up several soaks of one commit, in a record with the machine and seed of the first.
 
     Raises:
         ValueError: They are of different commits, or two have the same seed.

@@ -12,7 +12,7 @@ from typing import Any
 
 from benchmarks.soak.alone import ALONE, References, strike_alone
 from benchmarks.soak.faults import FAULTS
-from benchmarks.soak.parts import LAST, Broken, Part, killed_afterwards, list_checkpoints, read_rows
+from benchmarks.soak.parts import LAST, Broken, RunProcess, kill_on_exit, list_checkpoints, read_rows
 from benchmarks.soak.record import Record
 from jaxrl_vis.run.goodput import account, read_processes
 
@@ -44,42 +44,46 @@ class Soak:
         self.record = Record(seed=seed)
         self.reference: list[dict[str, Any]] = []
 
-    def undisturbed(self) -> None:
-        """Train the run that others are compared with."""
-        with killed_afterwards(Part.start(self._folder / "reference")) as part:
-            if part.end() != 0:
-                raise Broken("\n".join(part.lines))
-        self.reference = read_rows(part.folder)
+    def train_reference(self) -> None:
+        """Train the run that others are compared with, and store its rows.
 
-    def _next_fault(self, kinds: dict[str, Any]) -> str | None:
+        Raises:
+            Broken: The run failed.
+        """
+        with kill_on_exit(RunProcess.start(self._folder / "reference")) as process:
+            if process.wait() != 0:
+                raise Broken("\n".join(process.lines))
+        self.reference = read_rows(process.folder)
+
+    def _next_fault(self, faults: dict[str, Any]) -> str | None:
         """Draw the next fault of these kinds, all equally often; None if it is time to end."""
         with self._lock:
             if self._left <= 0 or time.monotonic() > self._deadline:
                 return None
             self._left -= 1
-            deck = self._decks.setdefault(next(iter(kinds)), [])
+            deck = self._decks.setdefault(next(iter(faults)), [])
             if not deck:
-                deck += self._dice.sample(list(kinds), len(kinds))
+                deck += self._dice.sample(list(faults), len(faults))
             return deck.pop()
 
-    def _return_fault(self, kinds: dict[str, Any], fault: str) -> None:
+    def _return_fault(self, faults: dict[str, Any], fault: str) -> None:
         """Return a fault to the deck, because the run had finished before it."""
         with self._lock:
             self._left += 1
-            self._decks[next(iter(kinds))].insert(0, fault)
+            self._decks[next(iter(faults))].insert(0, fault)
 
-    def _note_fault(self, where: str, fault: str, outcome: str) -> None:
+    def _note_fault(self, run: str, fault: str, outcome: str) -> None:
         with self._lock:
             self.record.faults[fault] += 1
             self.record.minutes = round((time.monotonic() - self._started) / 60.0, 2)
-            print(f"{self.record.total:4}  {where:8} {fault:32} {outcome}", flush=True)
+            print(f"{self.record.total:4}  {run:8} {fault:32} {outcome}", flush=True)
             self._note(self.record)
 
-    def _note_violation(self, where: Path, faults: list[str], error: Exception) -> None:
+    def _note_violation(self, folder: Path, faults: list[str], error: Exception) -> None:
         text = str(error) if isinstance(error, Broken) else traceback.format_exc()
         with self._lock:
-            self.record.broken.append(f"{where.name}, {faults}: {text}")
-            print(f"BROKEN in {where}, after {faults}: {text}", flush=True)
+            self.record.broken.append(f"{folder.name}, {faults}: {text}")
+            print(f"BROKEN in {folder}, after {faults}: {text}", flush=True)
             self._note(self.record)
 
     def work(self, worker: int) -> None:
@@ -91,27 +95,27 @@ class Soak:
             try:
                 # Workers begin with different kinds, so that a short soak covers both.
                 if self._alone and (turn + worker) % 2:
-                    going = self._one_alone(place, rng, faults)
+                    going = self._strike_alone(place, rng, faults)
                 else:
-                    going = self._one_run(place, rng, faults)
+                    going = self._strike_run(place, rng, faults)
             except Exception as error:  # the others continue; the folder is kept for inspection
                 self._note_violation(place, faults, error)
                 going = True
             if not going:
                 return
 
-    def _one_alone(self, place: Path, rng: random.Random, faults: list[str]) -> bool:
+    def _strike_alone(self, folder: Path, rng: random.Random, faults: list[str]) -> bool:
         fault = self._next_fault(ALONE)
         if fault is None:
             return False
         faults.append(fault)
-        if strike_alone(fault, place, rng, self._references):
-            self._note_fault(place.name, fault, "")
+        if strike_alone(fault, folder, rng, self._references):
+            self._note_fault(folder.name, fault, "")
         else:
             self._return_fault(ALONE, fault)
         return True
 
-    def _one_run(self, folder: Path, rng: random.Random, faults: list[str]) -> bool:
+    def _strike_run(self, folder: Path, rng: random.Random, faults: list[str]) -> bool:
         """Train one run to its end, with faults; return False if none is left for it."""
         spoilt, fault = False, None
         while len(faults) < FAULTS_PER_RUN:
@@ -128,25 +132,28 @@ class Soak:
                 raise Broken(f"status {status}: {LAST.lines[-4:]}")
             spoilt |= FAULTS[fault].spoils
             if folder.exists() and not (FAULTS[fault].spoils or FAULTS[fault].goes_back):
-                self._check_kept(folder, before, good[-1][0] if good else 0)
+                self._check_nothing_lost(folder, before, good[-1][0] if good else 0)
             self._note_fault(folder.name, fault, f"status {status}")
         if not faults:  # the run finished before the first fault, or it is time to end
             shutil.rmtree(folder, ignore_errors=True)
             return fault is not None
-        with killed_afterwards(Part.start(folder)) as part:
-            if (status := part.end()) != 0:
-                raise Broken(f"it did not finish: status {status}, {part.lines[-5:]}")
-            part.check_words()
+        with kill_on_exit(RunProcess.start(folder)) as process:
+            if (status := process.wait()) != 0:
+                raise Broken(f"it did not finish: status {status}, {process.lines[-5:]}")
+            process.check_output()
         self._check_end(folder, spoilt)
         return True
 
-    def _check_kept(self, folder: Path, before: list[dict[str, Any]], checkpointed: int) -> None:
+    def _check_nothing_lost(self, folder: Path, before: list[dict[str, Any]], checkpointed: int) -> None:
         """Check that no rows and no checkpoints were lost.
 
         Args:
             folder: The run.
             before: The rows when its last process began.
             checkpointed: Iteration of the newest checkpoint at that time.
+
+        Raises:
+            Broken: Rows up to that checkpoint are missing, or the newest checkpoint is more than one iteration older.
         """
         old = [row for row in before if row["iteration"] <= checkpointed]
         if read_rows(folder)[: len(old)] != old:

@@ -19,13 +19,13 @@ import numpy as np
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.host.worker_pool import evaluate_all, share_accelerator
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
-from jaxrl_vis.stalks.phenotyping.detector.gate import Gate, fit_gate, gate_path, logistic, write_gate
+from jaxrl_vis.stalks.phenotyping.detector.gate import Gate, fit_gate, fit_logistic_regression, gate_path, write_gate
 from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder
 from jaxrl_vis.stalks.phenotyping.detector.sections import STALK
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
 from jaxrl_vis.stalks.phenotyping.measure.borders import fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.training.examples import true_boxes
-from jaxrl_vis.stalks.phenotyping.training.held_out import MIN_SCORE, match_finds
+from jaxrl_vis.stalks.phenotyping.training.held_out import MIN_SCORE, match_to_annotations
 from jaxrl_vis_envs import plants
 from jaxrl_vis_envs.plants.pairs import Sequence
 
@@ -35,7 +35,7 @@ PLOTS = {"training": 28, "shifted": 28, "daylight_all": 36, "daylight_near": 20,
 """Number of plots of each family for fitting, and for testing."""
 FIRST_SEEDS = {"fit": 20_000, "test": 30_000}
 WIDTH, FRAMES = 844, 2
-RIGHT = 0.8
+MIN_F1 = 0.8
 """Minimum F1 of the detections of an image that counts as correct."""
 MAX_FLAGGED = 0.04
 AXES = 8
@@ -47,11 +47,11 @@ class ImageStatistics:
     """Statistics of the detector on one image.
 
     Attributes:
-        family: Family of the plot.
-        pooled: Pooled features of the network.
-        scores: Scores of the detections.
-        f1: F1 of the detections.
-        plain: Mean brightness and sharpness of the image.
+        family: Name of the plot's family, or ``photographs``; "" before it is known.
+        pooled: [C] float32, pooled features of the network.
+        scores: [N] float32, scores of the detections.
+        f1: F1 of the detections with a score of at least `MIN_SCORE`.
+        plain: Mean brightness and sharpness of the image (`brightness_and_sharpness`).
     """
 
     family: str
@@ -61,13 +61,20 @@ class ImageStatistics:
     plain: tuple[float, float]
 
 
-def draw(folder: Path, part: str, family: str, number: int) -> Path:
-    """Render images of one plot with their stalks into a file, unless it exists; return the file."""
-    path = folder / f"{part}_{family}_{number}.npz"
+def render_plot(folder: Path, purpose: str, family: str, number: int) -> Path:
+    """Render `FRAMES` random images of one plot and its true boxes into a .npz file, unless it exists; return its path.
+
+    Args:
+        folder: Folder of the file; created if it does not exist.
+        purpose: ``fit`` or ``test``, which selects the range of seeds.
+        family: Name of a file of `SPECS`, or of a family of `jaxrl_vis_envs.plants`.
+        number: Number of the plot, added to the first seed.
+    """
+    path = folder / f"{purpose}_{family}_{number}.npz"
     if path.exists():
         return path
     drawn_from = plants.read(FAMILIES / f"{family}.toml") if family in SPECS else plants.FAMILIES[family]
-    seed = FIRST_SEEDS[part] + number
+    seed = FIRST_SEEDS[purpose] + number
     sequence = Sequence.of(plants.draw(drawn_from.at_width(WIDTH), seed))
     true, arrays = sequence.drive.true, {}
     for index, frame in enumerate(np.random.default_rng(seed).choice(len(sequence), FRAMES, replace=False)):
@@ -81,7 +88,7 @@ def draw(folder: Path, part: str, family: str, number: int) -> Path:
     return path
 
 
-def plain_measures(image: np.ndarray) -> tuple[float, float]:
+def brightness_and_sharpness(image: np.ndarray) -> tuple[float, float]:
     """Return mean brightness, and sharpness (logarithm of the Laplacian's variance), of an image [H, W, 3] uint8."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float64)
     return float(grey.mean()), float(np.log(cv2.Laplacian(grey, cv2.CV_64F).var() + 1e-3))
@@ -90,20 +97,35 @@ def plain_measures(image: np.ndarray) -> tuple[float, float]:
 def detect_stalks(
     finder: Finder, image: np.ndarray, pixels_per_metre: float | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Detect stalks in an image: return detections [N, 6] in its own coordinates, their scores, and the pooled features."""
+    """Detect stalks in an image whose borders are filled.
+
+    Args:
+        finder: The detector.
+        image: [H, W, 3] uint8.
+        pixels_per_metre: Pixels per metre at the plants; None if unknown.
+
+    Returns:
+        Detections [N, 6] in pixels of ``image``, their scores [N], and the pooled features [C].
+    """
     frame = find_frame(image)
-    stalks, scores, pooled = finder.look(fill_borders(image, frame), pixels_per_metre)
+    stalks, scores, pooled = finder.detect_boxes(fill_borders(image, frame), pixels_per_metre)
     over, down = frame.columns[0], frame.lines[0]
     return stalks + np.array([over, down, over, down, over, over], np.float32), scores, pooled
 
 
-def f1_of(hits: int, finds: int, stalks: int) -> float:
-    """Return the F1 score; 1 if there is nothing and nothing is detected."""
-    return 2.0 * hits / (finds + stalks) if finds + stalks else 1.0
+def f1_score(hits: int, detections: int, stalks: int) -> float:
+    """Return the F1 score for the numbers of correct detections, of detections and of stalks; 1 if the last two are 0."""
+    return 2.0 * hits / (detections + stalks) if detections + stalks else 1.0
 
 
-def detections_in(path: Path, finder: Finder, name: str) -> list[ImageStatistics]:
-    """Evaluate the images of a file of `draw`, or read the cached results of the detector of this name."""
+def image_statistics(path: Path, finder: Finder, name: str) -> list[ImageStatistics]:
+    """Return the statistics of each image in a file of `render_plot`, from the cache beside it, which is written if missing.
+
+    Args:
+        path: The file.
+        finder: The detector.
+        name: Name of the detector, whose last word identifies the cache.
+    """
     cached = path.with_suffix(f".{name.split()[-1]}.npz")
     if not cached.exists():
         arrays = {}
@@ -124,41 +146,63 @@ def _detect_images(path: Path, finder: Finder) -> Iterator[ImageStatistics]:
     with np.load(path) as data:
         for index in range(FRAMES):
             image, truth, kinds = (data[f"{name}_{index}"] for name in ("image", "stalks", "kinds"))
-            stalks, scores, pooled = detect_stalks(finder, image, float(data["density"]))
-            right, ignored = match_finds(stalks, scores, truth, kinds)
+            stalks, scores, pooled = detect_stalks(finder, image, float(data["pixels_per_metre"]))
+            right, ignored = match_to_annotations(stalks, scores, truth, kinds)
             counted = (scores >= MIN_SCORE) & ~ignored
-            f1 = f1_of(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
-            yield ImageStatistics("", pooled, scores, f1, plain_measures(image))
+            f1 = f1_score(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
+            yield ImageStatistics("", pooled, scores, f1, brightness_and_sharpness(image))
 
 
-def detections_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[ImageStatistics]:
-    """Evaluate photographs, whose cameras are unknown."""
+def photograph_statistics(photographs: Iterator[Photograph], finder: Finder) -> Iterator[ImageStatistics]:
+    """Yield the statistics of each photograph, detected without a known resolution, because the cameras are unknown."""
     for image, count, find_boxes in photographs:
         stalks, scores, pooled = detect_stalks(finder, image, None)
         boxes = stalks[scores >= MIN_SCORE][:, :4]
-        yield ImageStatistics("photographs", pooled, scores, f1_of(find_boxes(boxes), len(boxes), count), plain_measures(image))
+        yield ImageStatistics(
+            "photographs", pooled, scores, f1_score(find_boxes(boxes), len(boxes), count), brightness_and_sharpness(image)
+        )
 
 
-def area_under_roc(values: np.ndarray, wrong: np.ndarray) -> float:
-    """Return the probability that a wrong image has a higher value than a correct one; NaN without such pairs."""
-    above = values[wrong][:, None] - values[~wrong][None, :]
+def area_under_roc(values: np.ndarray, misread: np.ndarray) -> float:
+    """Return the area under the ROC curve: the probability that a misread image has a higher value than another.
+
+    Args:
+        values: [N] float, one for each image.
+        misread: [N] bool, True if the image was misread.
+
+    Returns:
+        The area, in which ties count one half; NaN if all images or none were misread.
+    """
+    above = values[misread][:, None] - values[~misread][None, :]
     return float(np.mean((above > 0) + 0.5 * (above == 0))) if above.size else float("nan")
 
 
-def control(fitted: list[ImageStatistics], tried: list[ImageStatistics]) -> np.ndarray:
-    """Return the doubts [N] by a logistic regression on brightness and sharpness, their squares and product."""
+def control_logits(fitted: list[ImageStatistics], tested: list[ImageStatistics]) -> np.ndarray:
+    """Return the logits [N] of a logistic regression on brightness and sharpness, their squares and product.
+
+    Args:
+        fitted: Images on which the regression is fitted.
+        tested: The N images for which the logits of being misread are returned.
+    """
 
     def inputs(images: list[ImageStatistics]) -> np.ndarray:
         plain = (np.array([image.plain for image in images]) - [100.0, 6.0]) / [50.0, 2.0]
         return np.concatenate([plain, plain**2, plain[:, :1] * plain[:, 1:]], axis=1)
 
-    weights = logistic(inputs(fitted), np.array([image.f1 < RIGHT for image in fitted]))
-    return weights[0] + inputs(tried) @ weights[1:]
+    weights = fit_logistic_regression(inputs(fitted), np.array([image.f1 < MIN_F1 for image in fitted]))
+    return weights[0] + inputs(tested) @ weights[1:]
 
 
 def report(name: str, images: list[ImageStatistics], gate: Gate, doubts_of_control: np.ndarray) -> None:
-    """Print a line of figures."""
-    wrong = np.array([image.f1 < RIGHT for image in images])
+    """Print a line: number of misread images, area under the ROC curve of gate and control, and shares flagged by the gate.
+
+    Args:
+        name: Label of the line.
+        images: Statistics of N images.
+        gate: The gate.
+        doubts_of_control: [N] logits of `control_logits`.
+    """
+    wrong = np.array([image.f1 < MIN_F1 for image in images])
     doubts = np.array([gate.doubt(image.pooled, image.scores) for image in images])
     flagged = doubts > gate.threshold
     parts = [f"{wrong.sum()} of {len(images)} read wrongly"]
@@ -172,12 +216,12 @@ def report(name: str, images: list[ImageStatistics], gate: Gate, doubts_of_contr
     print(f"{name:14} " + "; ".join(parts), flush=True)
 
 
-def _made(folder: Path, tasks: list[tuple[str, str, int]], index: int) -> dict[str, str]:
-    return {"path": str(draw(folder, *tasks[index]))}
+def _render_task(folder: Path, tasks: list[tuple[str, str, int]], index: int) -> dict[str, str]:
+    return {"path": str(render_plot(folder, *tasks[index]))}
 
 
 def main() -> None:
-    """Render, fit, write and measure."""
+    """Render the images, fit the gate, write it beside the weights, and print its figures on the images for testing."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--weights", type=Path, default=SHIPPED)
@@ -196,7 +240,7 @@ def main() -> None:
     if not options.drawn:
         if options.workers > 1:
             share_accelerator()
-        done = functools.partial(_made, options.folder, tasks)
+        done = functools.partial(_render_task, options.folder, tasks)
         evaluate_all(done, range(len(tasks)), options.workers, lambda place, made: print(made["path"], flush=True))
     enable_compilation_cache()
     finder = load_finder(options.weights, MIN_SCORE)
@@ -204,18 +248,18 @@ def main() -> None:
     for part, family, number in tasks:
         path = options.folder / f"{part}_{family}_{number}.npz"
         if path.exists():
-            seen[part] += detections_in(path, finder, detector_name(options.weights))
+            seen[part] += image_statistics(path, finder, detector_name(options.weights))
     fitted, tried = seen["fit"], seen["test"]
-    wrong = np.array([image.f1 < RIGHT for image in fitted])
+    wrong = np.array([image.f1 < MIN_F1 for image in fitted])
     pooled, plots = np.array([image.pooled for image in fitted]), np.arange(len(fitted)) // FRAMES
     gate = fit_gate(pooled, [image.scores for image in fitted], wrong, plots, AXES, MAX_FLAGGED)
     about = {"images": len(fitted), "families": list(PLOTS), "origin": "synthetic images alone"}
     write_gate(options.weights, gate, about)
     if options.photographs:
         module, _, name = options.photographs.partition(":")
-        tried += detections_in_photographs(getattr(importlib.import_module(module), name)(), finder)
-    doubts = control(fitted, tried)
-    print(f"{detector_name(options.weights)}: {len(fitted)} images to fit on, {len(tried)} to try; right is F1 >= {RIGHT:g}")
+        tried += photograph_statistics(getattr(importlib.import_module(module), name)(), finder)
+    doubts = control_logits(fitted, tried)
+    print(f"{detector_name(options.weights)}: {len(fitted)} images to fit on, {len(tried)} to try; right is F1 >= {MIN_F1:g}")
     report("all", tried, gate, doubts)
     for family in dict.fromkeys(image.family for image in tried):
         chosen = [place for place, image in enumerate(tried) if image.family == family]

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.stalks.worker_rate import Once, options, print_rate
+from benchmarks.stalks.worker_rate import Once, parse_options, print_rate
 from jaxrl_vis.host.provenance import device_name
 from jaxrl_vis.stalks.grasping.evaluation.scoring import Scene, draw_scene
 from jaxrl_vis.stalks.grasping.masks.painter import SHIPPED, Painter, read_weights
@@ -23,7 +23,7 @@ from jaxrl_vis.stalks.grasping.perception.perceive import Perception, perceive
 from jaxrl_vis_envs.plants.grasping import GRASPING_FAMILIES
 
 
-def look(scene: Scene, painter: Painter) -> Perception:
+def perceive_scene(scene: Scene, painter: Painter) -> Perception:
     """Compute the perception of all pairs of a run."""
     return perceive(scene.views, lambda image, _: painter(image), scene.drive.stated, scene.mount)
 
@@ -35,22 +35,22 @@ def make(path: Path) -> tuple[Once, int]:
     painter = Painter(params, settings)
 
     def once(number: int) -> list[float]:
-        return [float(value) for point in look(scenes[number], painter).points for value in point.point]
+        return [float(value) for point in perceive_scene(scenes[number], painter).points for value in point.point]
 
     return once, len(scenes)
 
 
 if __name__ == "__main__":
-    asked = options()
+    asked = parse_options()
     family = GRASPING_FAMILIES["shifted"]
     family = family if asked.width is None else family.at_width(asked.width)
     scenes = [draw_scene(family, seed) for seed in range(3)]
     params, settings, _ = read_weights(SHIPPED)
     painter = Painter(params, settings)
     started = time.perf_counter()
-    look(scenes[0], painter)
+    perceive_scene(scenes[0], painter)
     first = time.perf_counter() - started
-    runs = [look(scenes[number % len(scenes)], painter) for number in range(asked.repeats)]
+    runs = [perceive_scene(scenes[number % len(scenes)], painter) for number in range(asked.repeats)]
     assert len({str([point.point for point in run.points]) for run in runs}) > 1, "all runs gave the same"
     count = len(scenes[0].views)
     height, width = scenes[0].views[0].left.shape[:2]

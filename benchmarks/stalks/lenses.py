@@ -23,11 +23,11 @@ from jaxrl_vis.host.provenance import device_name, revision
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
 from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
-from jaxrl_vis.stalks.phenotyping.evaluation.scoring import match
+from jaxrl_vis.stalks.phenotyping.evaluation.scoring import match_detections
 from jaxrl_vis.stalks.phenotyping.evaluation.synth import plot_name, write_plots
 from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
 from jaxrl_vis.stalks.phenotyping.io.images import read_image
-from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
+from jaxrl_vis.stalks.phenotyping.track.direction import track_either_way
 from jaxrl_vis.stalks.phenotyping.track.heights import stalk_widths
 from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sighting, view_pair
 from jaxrl_vis_envs.documents import read_json
@@ -69,14 +69,14 @@ def evaluate_row(plot: Path, finder: Finder) -> dict[str, Any]:
         seen = [stalk for stalk in truth["seen"] if stalk["pair"] == int(row["pair"])]
         stalks = [StalkInView(**{name: stalk[name] for name in names}) for stalk in seen]
         view = view_pair(finder, left, right, calibration)
-        matched, scored = match(view.detections, stalks)
+        matched, scored = match_detections(view.detections, stalks)
         visible += sum(stalk.band_box is not None and stalk.band_visible >= 0.3 for stalk in stalks)
         detected += sum(hit > 0 for _, hit in scored)
         false_positives += sum(not hit for _, hit in scored)
         grounds += view.ground is not None
         frames.append(view.sightings)
         owners.append(matched)
-    tracks = follow_either_way(frames, np.array([float(row["distance_m"]) for row in rows]), calibration).tracks
+    tracks = track_either_way(frames, np.array([float(row["distance_m"]) for row in rows]), calibration).tracks
     counted = [track for track in tracks if track.counted]
     errors = {}
     for track, widths in zip(counted, stalk_widths(frames, counted)):

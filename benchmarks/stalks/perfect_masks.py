@@ -8,18 +8,28 @@ import argparse
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.measure.stalk import measure
-from jaxrl_vis.stalks.phenotyping.measure.stereo import grey
+from jaxrl_vis.stalks.phenotyping.measure.stalk import measure_stalk
+from jaxrl_vis.stalks.phenotyping.measure.stereo import to_greyscale
 from jaxrl_vis_envs.plants import FAMILIES, Family, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import outline, stalks_in_view
 
 
 def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]]:
-    """Measure one pair: return visibility, confidence and error (mm) by method, for stalks that are at least 0.3 visible."""
+    """Measure the stalks of one rendered stereo pair on their true masks.
+
+    Args:
+        family: Family of the plot.
+        seed: Seed of the plot.
+        frame: Index of the pair in its sequence.
+
+    Returns:
+        For each stalk that is at least 0.3 visible, its visibility, and confidence and error (mm) by method; stalks that a
+        method cannot measure are left out.
+    """
     sequence = Sequence.of(draw(family, seed))
     pair, drive = sequence[frame], sequence.drive
-    instance, left, right = np.asarray(pair.instance), grey(np.asarray(pair.left)), grey(np.asarray(pair.right))
+    instance, left, right = np.asarray(pair.instance), to_greyscale(np.asarray(pair.left)), to_greyscale(np.asarray(pair.right))
     rows = []
     for view in stalks_in_view(sequence.plot, pair.pose, drive.true, instance, np.asarray(pair.depth)):
         if view.band_box is None or view.band_visible < 0.3:
@@ -30,7 +40,7 @@ def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]
         stalk = sequence.plot.stalks[view.stalk]
         row = {"seen": view.band_visible}
         for method in ("strip", "ellipse"):
-            measurement = measure(mask, (top, begin), left, right, drive.stated, method=method)
+            measurement = measure_stalk(mask, (top, begin), left, right, drive.stated, method=method)
             if measurement.diameter_mm is None:
                 break
             heights = np.linspace(0.0, 0.6, 1201)

@@ -16,13 +16,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.stalks.worker_rate import Once, options, print_rate, timed
+from benchmarks.stalks.worker_rate import Once, parse_options, print_rate, time_repeats
 from jaxrl_vis.host.provenance import device_name
-from jaxrl_vis.stalks.phenotyping.detector.detect import detect, pad
+from jaxrl_vis.stalks.phenotyping.detector.detect import detect, pad_image
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, resize
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
 from jaxrl_vis.stalks.phenotyping.measure.ground import find_ground
-from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, find_with_ground, grey_at, measure_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, detect_with_ground, grey_at, measure_pair
 from jaxrl_vis_envs.plants import SHIFTED, Calibration, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import stalks_in_view
@@ -37,14 +37,14 @@ def make(path: Path, stated: Calibration) -> tuple[Once, int]:
 
     def once(number: int) -> list[float]:
         left, right = pairs[number]
-        detections, ground = find_with_ground(finder, left, right, stated)
+        detections, ground = detect_with_ground(finder, left, right, stated)
         return [sighting.diameter_mm or 0.0 for sighting in measure_pair(detections, left, right, stated, ground=ground)]
 
     return once, len(pairs)
 
 
 if __name__ == "__main__":
-    asked = options()
+    asked = parse_options()
     family = SHIFTED if asked.width is None else SHIFTED.at_width(asked.width)
     sequence = Sequence.of(draw(family, 3))
     pair = sequence[15]
@@ -54,18 +54,18 @@ if __name__ == "__main__":
 
     def once() -> tuple[Any, Any, list[Any]]:
         """Process one pair: detections, ground and sightings."""
-        detections, ground = find_with_ground(finder, left, right, stated)
+        detections, ground = detect_with_ground(finder, left, right, stated)
         return detections, ground, measure_pair(detections, left, right, stated, ground=ground)
 
     started = time.perf_counter()
     detections, ground, sightings = once()
     first = time.perf_counter() - started
     measured = sum(sighting.diameter_mm is not None for sighting in sightings)
-    seconds = timed(once, asked.repeats)
+    seconds = time_repeats(once, asked.repeats)
     print(f"{left.shape[1]} x {left.shape[0]}, {len(detections)} finds, {measured} measured, on {device_name()}")
     print(f"{np.median(seconds):.3f} s a pair (least {min(seconds):.3f}); the first one, which compiles, {first:.1f} s")
     pixels_per_metre = stated.focal / USUAL_DISTANCE
-    small = pad(resize(left, settings, pixels_per_metre)[0])
+    small = pad_image(resize(left, settings, pixels_per_metre)[0])
     dtype = finder.dtype
     parts = {
         "image to the device": lambda: jax.block_until_ready(jax.device_put(left)),
@@ -76,7 +76,7 @@ if __name__ == "__main__":
         "disparities and widths": lambda: measure_pair(detections, left, right, stated, ground=ground),
     }
     for name, part in parts.items():
-        print(f"  {np.median(timed(part, asked.repeats)):.4f} s  {name}")
+        print(f"  {np.median(time_repeats(part, asked.repeats)):.4f} s  {name}")
     print("what an evaluated pair costs besides:")
     on_device = (pair.left, pair.right, pair.instance, pair.depth)
     truth = np.asarray(pair.instance), np.asarray(pair.depth)
@@ -86,7 +86,7 @@ if __name__ == "__main__":
         "truth of the stalks": lambda: stalks_in_view(sequence.plot, pair.pose, sequence.drive.true, *truth),
     }
     for name, part in others.items():
-        print(f"  {np.median(timed(part, min(asked.repeats, 3))):.4f} s  {name}")
+        print(f"  {np.median(time_repeats(part, min(asked.repeats, 3))):.4f} s  {name}")
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB, drawing the pair included")
     if asked.workers:
         some = [sequence[frame] for frame in (5, 12, 19, 26)]

@@ -31,8 +31,8 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
     from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
     from jaxrl_vis.stalks.phenotyping.evaluation.perfect import perfect_detections
-    from jaxrl_vis.stalks.phenotyping.evaluation.scoring import match, true_diameter
-    from jaxrl_vis.stalks.phenotyping.track.sightings import find_with_ground, measure_pair
+    from jaxrl_vis.stalks.phenotyping.evaluation.scoring import match_detections, true_diameter
+    from jaxrl_vis.stalks.phenotyping.track.sightings import detect_with_ground, measure_pair
     from jaxrl_vis_envs.plants import FAMILIES, draw
     from jaxrl_vis_envs.plants.pairs import Sequence
     from jaxrl_vis_envs.plants.truth import HEIGHTS, stalks_in_view
@@ -49,11 +49,11 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
         left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
         views = stalks_in_view(sequence.plot, pair.pose, true, instance, np.asarray(pair.depth))
         ideal = perfect_detections(map(dataclasses.asdict, views), instance)
-        finds, ground = find_with_ground(
+        finds, ground = detect_with_ground(
             (lambda image, pixels_per_metre, band, ideal=ideal: ideal) if options.truth else finder, left, right, stated
         )
         sightings = measure_pair(finds, left, right, stated, ground=ground)
-        owners, _ = match(finds, views)
+        owners, _ = match_detections(finds, views)
         for find, sighting, owner in zip(finds, sightings, owners):
             at = sighting.height_m
             if owner is None or sighting.diameter_mm is None or at is None or abs(at - HEIGHTS[0]) > 0.0127:
@@ -67,7 +67,7 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
 
 
 def keep_masks(options: argparse.Namespace) -> None:
-    """Render plots, and write their masks."""
+    """Render plots, and write their masks, widths and true widths to ``options.file`` (.npz) for `compare`."""
     from jaxrl_vis.host.worker_pool import map_unordered, share_accelerator
 
     if options.workers > 1:
@@ -105,7 +105,11 @@ def plantcv_width(pcv: Any, mask: np.ndarray) -> float:
 
 
 def compare(file: Path) -> None:
-    """Print the width errors of both methods, mm."""
+    """Print the width errors of PlantCV and of this project on the stored masks, mm; exit with a line without PlantCV.
+
+    Args:
+        file: The .npz file with masks, true widths and this project's widths.
+    """
     try:
         from plantcv import plantcv as pcv  # pyright: ignore[reportMissingImports]
     except ImportError:

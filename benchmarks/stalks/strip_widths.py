@@ -9,7 +9,7 @@ import argparse
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.measure.width import ELLIPSE_FITS, ellipse_width, strip_width
+from jaxrl_vis.stalks.phenotyping.measure.width import ELLIPSE_FITS, ellipse_width, fit_strip
 
 RATIOS = (1.5, 3.0, 6.0, 12.0)
 LEANS = (0.0, 2.0, 8.0, 14.0, 20.0)
@@ -38,25 +38,43 @@ def ideal_strip(width: float, ratio: float, lean: float, position: tuple[float, 
     return inside.reshape(size, fine, size, fine).mean(axis=(1, 3)).astype(np.float32)
 
 
-def mean_errors(estimate, ratio: float, lean: float, soft: bool, places: int, widths: tuple[float, ...]) -> np.ndarray:
-    """Return the mean relative error of an estimator for each width."""
+def mean_errors(estimate, ratio: float, lean: float, soft: bool, positions: int, widths: tuple[float, ...]) -> np.ndarray:
+    """Return the mean relative error [len(widths)] of a width estimator; NaN where it returned None for a strip.
+
+    Args:
+        estimate: Function from a mask [H, W] to its width, pixels, or None.
+        ratio: Ratio of length to width.
+        lean: Tilt, degrees.
+        soft: Rasterise covered fractions instead of bool.
+        positions: Number of random sub-pixel positions per width.
+        widths: True widths, pixels.
+    """
     rng = np.random.default_rng(0)
     errors = []
     for width in widths:
-        estimates = [estimate(ideal_strip(width, ratio, lean, tuple(rng.uniform(-0.5, 0.5, 2)), soft)) for _ in range(places)]
+        estimates = [
+            estimate(ideal_strip(width, ratio, lean, tuple(rng.uniform(-0.5, 0.5, 2)), soft)) for _ in range(positions)
+        ]
         errors.append(np.mean([np.nan if estimated is None else estimated / width - 1.0 for estimated in estimates]))
     return np.array(errors)
 
 
-def strip(mask: np.ndarray) -> float | None:
-    """Return the width by `strip_width`; None if it finds none."""
-    strip = strip_width(mask)
+def width_by_strip(mask: np.ndarray) -> float | None:
+    """Return the width by `fit_strip`; None if it finds none."""
+    strip = fit_strip(mask)
     return None if strip is None else strip.width()
 
 
-def table(places: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> list[str]:
-    """Return the lines of a Markdown table."""
-    estimators = {"strip": strip} | {f"ellipse, {fit}": lambda mask, fit=fit: ellipse_width(mask, fit) for fit in ELLIPSE_FITS}
+def table(positions: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> list[str]:
+    """Return the lines of a Markdown table: for each estimator, mask, tilt and ratio, the mean error at the worst width.
+
+    Args:
+        positions: Number of random sub-pixel positions per width.
+        widths: True widths, pixels.
+    """
+    estimators = {"strip": width_by_strip} | {
+        f"ellipse, {fit}": lambda mask, fit=fit: ellipse_width(mask, fit) for fit in ELLIPSE_FITS
+    }
     lines = [
         "| estimator | mask | lean | " + " | ".join(f"L/W {ratio:g}" for ratio in RATIOS) + " |",
         "|---|---|---" + "|---" * len(RATIOS) + "|",
@@ -64,7 +82,7 @@ def table(places: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> l
     for name, estimate in estimators.items():
         for soft in (True, False) if name == "strip" else (False,):
             for lean in LEANS if name == "strip" else (0.0, 20.0):
-                errors = [mean_errors(estimate, ratio, lean, soft, places, widths) for ratio in RATIOS]
+                errors = [mean_errors(estimate, ratio, lean, soft, positions, widths) for ratio in RATIOS]
                 worst = [row[np.nanargmax(np.abs(row))] if np.isfinite(row).any() else np.nan for row in errors]
                 cells = " | ".join(f"{100 * error:+.2f} %" for error in worst)
                 lines.append(f"| {name} | {'soft' if soft else 'hard'} | {lean:g} | {cells} |")

@@ -13,7 +13,7 @@ Once = Callable[[int], list[float]]
 """Function that runs the job once on the input of that index, and returns numbers that characterise the result."""
 
 
-def timed(run: Callable[[], object], repeats: int) -> list[float]:
+def time_repeats(run: Callable[[], object], repeats: int) -> list[float]:
     """Return the time of each repeat, s, after a first call that compiles."""
     run()
     times = []
@@ -24,7 +24,7 @@ def timed(run: Callable[[], object], repeats: int) -> list[float]:
     return times
 
 
-def options() -> argparse.Namespace:
+def parse_options() -> argparse.Namespace:
     """Parse the options of the scripts; with workers, let processes share the GPU."""
     parser = argparse.ArgumentParser(description="Time and memory for one synthetic pair.")
     parser.add_argument("--repeats", type=int, default=5)

@@ -16,24 +16,24 @@ from jaxrl_vis.learner.networks.policy import make_policy
 from jaxrl_vis.types import Batch, Metrics, Params, Statistics
 
 
-class Cloned(NamedTuple):
-    """Actor and its optimiser."""
+class AgentState(NamedTuple):
+    """Parameters of the actor and state of its optimiser (Adam)."""
 
     actor: Params
     optimizer: Any
 
 
 def make(setup: Setup) -> Algorithm:
-    """Build the behaviour cloning algorithm."""
+    """Build behaviour cloning: mean squared error between the actor's action and the batch's, with an encoder of its own."""
     config = setup.config.replace(encoders="separate")  # the actor has an encoder of its own: there is no critic
     networks = Networks(config, setup.observation_spec, setup.action_size, 0.0)
     policy = make_policy(networks)
 
-    def init(key: jax.Array) -> Cloned:
+    def init(key: jax.Array) -> AgentState:
         actor = networks.init_actor(key)
-        return Cloned(actor, adam.init(actor))
+        return AgentState(actor, adam.init(actor))
 
-    def step(agent: Cloned, statistics: Statistics, batch: Batch, key: jax.Array) -> tuple[Cloned, Metrics]:
+    def step(agent: AgentState, statistics: Statistics, batch: Batch, key: jax.Array) -> tuple[AgentState, Metrics]:
         inputs = networks.prepare_batch(networks.batch_scaling(statistics), batch)
 
         def loss(actor: Params) -> jax.Array:
@@ -45,9 +45,9 @@ def make(setup: Setup) -> Algorithm:
         count = adam.count(agent.optimizer) + 1
         correction = adam.corrections(count[None])[0]
         actor, moments = adam.step(agent.actor, gradient, agent.optimizer, config.ddpg.actor_learning_rate, correction)
-        return Cloned(actor, adam.with_count(moments, count)), {"train/imitation_loss": value}
+        return AgentState(actor, adam.with_count(moments, count)), {"train/imitation_loss": value}
 
-    def policy_params(agent: Cloned, statistics: Statistics) -> Any:
+    def policy_params(agent: AgentState, statistics: Statistics) -> Any:
         return policy.params(agent.actor, statistics)
 
     return Algorithm(init, policy.act, scan_batches(step), policy_params, policy.aim)

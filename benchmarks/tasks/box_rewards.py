@@ -24,11 +24,17 @@ _EDGES = (0.0, 1e-4, 1e-3, 5e-3, 0.02, np.inf)  # m
 _TOLERANT = {"tolerance": 8.0, "share": 0.99}  # the defaults of indicator_tolerance
 
 
-def record(env: Any, episodes: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Play the scripted pusher in N episodes.
+def record_pushes(env: Any, episodes: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Roll out the scripted pusher for N episodes.
+
+    Args:
+        env: VisualFetchPush, with RGB-D images.
+        episodes: N.
+        seed: Seed of the starts and goals.
 
     Returns:
-        Images [N, T+1, 4, H, W] uint8, the same with the arm lifted from the box, and positions of the box [N, T+1, 3] (m).
+        Images [N, T+1, 4, H, W] uint8; images of the same boxes with the arm in the pose of a goal, clear of the box; and
+        positions of the box [N, T+1, 3], m.
     """
     state, aims = environments.reset(env, jax.random.split(jax.random.key(seed), episodes))
     policy, memory = controllers.fetch_push(env)
@@ -36,12 +42,12 @@ def record(env: Any, episodes: int, seed: int = 0) -> tuple[np.ndarray, np.ndarr
     first = env.mj_model.joint("box").qposadr[0]
     lifted = env.sample_goal(jax.random.key(0))
 
-    def both(qpos: jax.Array) -> jax.Array:
+    def render_both(qpos: jax.Array) -> jax.Array:
         alone = jax.lax.dynamic_update_slice(lifted.qpos, jax.lax.dynamic_slice(qpos, (first,), (7,)), (first,))
         poses = jax.vmap(lambda qpos: mjx_model.kinematics(env._model, lifted.replace(qpos=qpos)))(jnp.stack([qpos, alone]))
         return jax.vmap(lambda data: env.observe(env.state_at(data, jnp.zeros(3))))(poses)
 
-    draw = jaxrl_vis_envs.jit(jax.vmap(both))
+    draw = jaxrl_vis_envs.jit(jax.vmap(render_both))
     images, places = [], []
     for step in range(env.horizon + 1):
         images.append(np.asarray(draw(state.data.qpos)))
@@ -54,14 +60,14 @@ def record(env: Any, episodes: int, seed: int = 0) -> tuple[np.ndarray, np.ndarr
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the shares of occluded boxes, and the shares of positive rewards by the distance of the box from its goal."""
     parser = argparse.ArgumentParser(
         description="Indicator rewards of VisualFetchPush, on whole images and on the box's pixels."
     )
     parser.add_argument("--episodes", type=int, default=32)
     options = parser.parse_args()
     env = environments.make("VisualFetchPush", goal_mask="object", met_goals=False)
-    seen, alone, places = record(env, options.episodes)
+    seen, alone, places = record_pushes(env, options.episodes)
     mask, whole = np.asarray(object_mask(seen)), np.asarray(object_mask(alone))
     hidden, gone = (mask != whole).any((-3, -2, -1)), ~mask.any((-3, -2, -1))
     sizes = whole.sum((-3, -2, -1))

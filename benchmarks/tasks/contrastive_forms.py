@@ -30,7 +30,11 @@ def balanced(setup: Setup) -> Algorithm:
 
 
 def balanced_loss(logits: jax.Array) -> jax.Array:
-    """Compute the binary cross-entropy of the B positives plus that of the B (B - 1) negatives, a mean each: [] float32."""
+    """Return the mean binary cross-entropy of the B positives plus that of the B (B - 1) negatives, [] float32.
+
+    Args:
+        logits: [B, B] float32 with B > 1, positives on the diagonal.
+    """
     following, size = jnp.diagonal(logits), len(logits)
     negatives = jnp.sum(jax.nn.softplus(logits)) - jnp.sum(jax.nn.softplus(following))
     return jnp.mean(jax.nn.softplus(-following)) + negatives / (size * (size - 1))

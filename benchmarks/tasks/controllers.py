@@ -125,11 +125,18 @@ POLICIES: dict[str, Callable[[Any], tuple[Policy, Any]]] = {
 
 
 def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> float:
-    """Return the success rate of the controller of task ``name``, with ``overrides`` of the task's settings."""
+    """Return the success rate of a task's controller at the last step.
+
+    Args:
+        name: Key of `POLICIES`, or ``FingerTurn``.
+        episodes: Number of episodes.
+        seed: Seed of starts and goals.
+        **overrides: Settings of the task that differ from its defaults.
+    """
     env = environments.make(name, **overrides)
     state, goals = environments.reset(env, jax.random.split(jax.random.key(seed), episodes))
     if name == "FingerTurn":
-        return turn_the_finger(env, state, np.random.default_rng(seed))
+        return finger_turn_success(env, state, np.random.default_rng(seed))
     policy, memory = POLICIES[name](env)
     act = jaxrl_vis_envs.jit(jax.vmap(policy))
     memory = jax.tree.map(lambda leaf: jnp.tile(leaf, (episodes, 1)), memory)
@@ -139,8 +146,14 @@ def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> f
     return float(np.mean(state.metrics["success"]))
 
 
-def turn_the_finger(env: Any, state: Any, generator: np.random.Generator) -> float:
-    """Return the success rate on FingerTurn of random shooting: the first action of the best of many plans in C MuJoCo."""
+def finger_turn_success(env: Any, state: Any, generator: np.random.Generator) -> float:
+    """Return the success rate of random shooting on FingerTurn: take the first action of the best of many plans in C MuJoCo.
+
+    Args:
+        env: FingerTurn.
+        state: Initial states of E episodes.
+        generator: Source of the plans.
+    """
     threads = [mujoco.MjData(env.mj_model) for _ in range(os.cpu_count() or 1)]
     plans = np.zeros((len(state.reward), _PLAN_STEPS, 2))
     with mujoco.rollout.Rollout(nthread=len(threads)) as pool:
@@ -170,9 +183,15 @@ def _plan(
     substeps: int,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Return the actions [E, _PLAN_STEPS, 2] that bring the spinner nearest to ``goal_angle`` [E] (rad), or 0 if that suffices.
+    """Return the plans [E, _PLAN_STEPS, 2] that bring the spinner nearest to its goal, or zeros where these suffice.
 
-    ``start`` is [E, 7]: time, positions, velocities. ``try_out`` returns such rows for the final states of many motions.
+    Args:
+        try_out: Function from initial states [M, 7] and controls [M, T, 2] to final states [M, 7].
+        start: [E, 7], time, joint positions and joint velocities.
+        goal_angle: [E], rad.
+        last_plans: [E, _PLAN_STEPS, 2], also considered.
+        substeps: Physics steps per control step.
+        generator: Source of the plans.
     """
     episodes = np.arange(len(start))
     plans = generator.uniform(-1.0, 1.0, (len(start), _PLANS, _PLAN_STEPS, 2))

@@ -47,7 +47,7 @@ class Goals(NamedTuple):
 
 
 def draw_goals(env: Any, count: int, seed: int = 0) -> Goals:
-    """Sample and render the goals of ``count`` episodes."""
+    """Sample the goals of ``count`` episodes with the random key ``seed``; render one frame and one segmentation each."""
     size = env.observation_spec.shape[-1]
     scene = Scene.from_mjmodel(env.mj_model, env.camera, size, size)
 
@@ -66,11 +66,11 @@ def draw_goals(env: Any, count: int, seed: int = 0) -> Goals:
 
 
 def visible_pixels(env: Any, labels: np.ndarray, geoms: tuple[str, ...]) -> np.ndarray:
-    """Count the pixels of each image [N] that show any of these geoms."""
+    """Return the number of pixels, [N] int, that show any of the named geoms, for segmentations ``labels`` [N, H, W]."""
     return np.isin(labels, [env.mj_model.geom(name).id for name in geoms]).sum(axis=(1, 2))
 
 
-def compare(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, int]]:
+def compare_pairs(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, int]]:
     """Compare pairs of goals that are more than a threshold apart.
 
     Returns:
@@ -91,10 +91,16 @@ def compare(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, i
 
 
 def report(name: str, count: int, size: int) -> bool:
-    """Print the results of a task; return True if there are no identical images and no occluded parts."""
+    """Print the results of a task; return True if no distinct goals have identical images and no required part is occluded.
+
+    Args:
+        name: Name of the visual task.
+        count: Number of goals.
+        size: Height and width of the images, pixels.
+    """
     env: Any = jaxrl_vis_envs.make(name, image_size=size, pixels="rgbd")
     goals = draw_goals(env, count)
-    identical, near, nearest, pair = compare(goals, env.threshold)
+    identical, near, nearest, pair = compare_pairs(goals, env.threshold)
     print(f"{name}: {count} goals at {size}x{size}, {len(goals.images[0])} channels")
     print(f"  identical images of goals more than {env.threshold:g} {env.distance_unit} apart: {identical} pairs")
     span = f"{env.threshold:g} to {_NEAR * env.threshold:g} {env.distance_unit}"

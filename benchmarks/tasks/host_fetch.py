@@ -19,7 +19,7 @@ SHAPE = (32, 32, 1)
 _NEAR, _FAR = 0.25, 1.25
 
 # Their triangles are half of all, and out of the camera's sight.
-_UNSEEN = ("robot0:estop_link", "robot0:laser_link")
+_HIDDEN = ("robot0:estop_link", "robot0:laser_link")
 
 Policy = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Function (image, goal image, true displacement [3] to the goal, m) -> action [4]; learners ignore the displacement."""
@@ -43,8 +43,14 @@ class Episode(NamedTuple):
     is_reached: bool
 
 
-def with_noise(image: np.ndarray, noise: float, draw: np.random.Generator) -> np.ndarray:
-    """Return images [...] uint8 with Gaussian noise of the standard deviation ``noise``, grey levels."""
+def add_noise(image: np.ndarray, noise: float, draw: np.random.Generator) -> np.ndarray:
+    """Return images [...] uint8 with Gaussian noise added, rounded and clipped to 0 to 255.
+
+    Args:
+        image: [...] uint8.
+        noise: Standard deviation, grey levels; 0 draws nothing.
+        draw: Source of the noise.
+    """
     noisy = image + np.float32(noise) * draw.standard_normal(image.shape, np.float32) if noise else image
     return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
@@ -71,13 +77,13 @@ def make_env() -> Any:
 
 
 class Camera:
-    """Camera of an environment of MuJoCo. Close it to free the GL context."""
+    """Depth camera of an environment of MuJoCo. Close it to free the GL context."""
 
     def __init__(self, env: Any) -> None:
-        """Open the GL context."""
+        """Open the GL context; make the mocap body and `_HIDDEN` transparent in the environment's model, in place."""
         model, self._data = env.model, env.data
         for geom in range(model.ngeom):
-            if model.geom(geom).name in _UNSEEN or model.body(model.geom_bodyid[geom]).name == "robot0:mocap":
+            if model.geom(geom).name in _HIDDEN or model.body(model.geom_bodyid[geom]).name == "robot0:mocap":
                 model.geom_rgba[geom, 3] = 0.0
         model.vis.quality.offsamples = 0  # no antialiasing
         self._renderer = mujoco.Renderer(model, *SHAPE[:2])
@@ -87,8 +93,8 @@ class Camera:
         self._view.azimuth, self._view.elevation = 180.0, -30.0
         self._options.sitegroup[:] = 0  # the goal is a site
 
-    def image(self) -> np.ndarray:
-        """Render an image [32, 32, 1] uint8."""
+    def render(self) -> np.ndarray:
+        """Render a depth image [32, 32, 1] uint8: 0 at 0.25 m and nearer, 255 at 1.25 m and farther, linear in between."""
         self._renderer.update_scene(self._data, self._view, self._options)
         share = (self._renderer.render()[..., None] - _NEAR) / (_FAR - _NEAR)
         return np.round(255.0 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
@@ -102,7 +108,15 @@ class HostFetch:
     """FetchReach with one robot and its camera. Close it to free the GL context."""
 
     def __init__(self, noise: float, seed: int) -> None:
-        """Make the environment; ``noise`` is the standard deviation of the camera noise, grey levels."""
+        """Make the environment.
+
+        Args:
+            noise: Standard deviation of the camera noise, grey levels.
+            seed: Seed of the sequences of goals and of noise.
+
+        Raises:
+            RequestError: As in `make_env`.
+        """
         self._env, self._noise = make_env(), noise
         self._camera = Camera(self._env)
         self.reseed(seed)
@@ -119,10 +133,13 @@ class HostFetch:
         return self._env.step(np.asarray(action, np.float32))[0]["achieved_goal"]
 
     def _image(self) -> np.ndarray:
-        return with_noise(self._camera.image(), self._noise, self._draw)
+        return add_noise(self._camera.render(), self._noise, self._draw)
 
-    def episode(self, policy: Policy) -> Episode:
-        """Roll out an episode."""
+    def run_episode(self, policy: Policy) -> Episode:
+        """Roll out an episode of `HORIZON` steps; actions are clipped to [-1, 1].
+
+        The goal image is taken after ten actions of a proportional controller towards the goal, before the robot is reset.
+        """
         grip, goal = self._begin()
         for _ in range(10):
             grip = self._step(np.append(np.clip(10.0 * (goal - grip), -1.0, 1.0), 0.0))

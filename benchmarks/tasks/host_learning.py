@@ -23,7 +23,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from benchmarks.tasks.host_fetch import ACTION_SIZE, HORIZON, SHAPE, THRESHOLD, HostFetch, with_noise
+from benchmarks.tasks.host_fetch import ACTION_SIZE, HORIZON, SHAPE, THRESHOLD, HostFetch, add_noise
 from jaxrl_vis import indicator
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
@@ -41,7 +41,7 @@ _SMALL: dict[str, Any] = {
     "hidden_sizes": (128, 128),
 }
 _SEEDS, _NOISES, _EVALUATION_SEED, _BEHAVIOUR_SEED = (100, 101, 102), (2, 5), 10_000, 20_000
-WANTED, IN_A_ROW = 0.9, 3
+TARGET_SUCCESS, IN_A_ROW = 0.9, 3
 _LATEST = 20
 """Number of the last updates' metrics that a record averages."""
 
@@ -51,7 +51,7 @@ class Cell:
     """One run.
 
     Attributes:
-        mode: ``live`` or ``recorded``.
+        mode: ``learn_online`` or ``learn_offline``.
         method: ``exact``, ``tolerance``, ``oracle``, ``contrastive`` or ``cloning``.
         noise: Standard deviation of the camera noise, grey levels.
         seed: Seed of the learner and, live, of the robot.
@@ -68,7 +68,7 @@ class Cell:
         return f"{self.mode}_{self.method}_noise{self.noise}_seed{self.seed}"
 
     def options(self) -> dict[str, Any]:
-        """Return the options of the learner."""
+        """Return the keyword arguments of `indicator.Learner`."""
         of_method: dict[str, dict[str, Any]] = {
             "exact": {"method": "indicator_balance_filter", "relabel_probability": 0.8},
             # Noise of sigma differs by sigma sqrt(2) between two images; without noise, a few grey levels.
@@ -82,7 +82,17 @@ class Cell:
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """Lengths of runs; the defaults are what is recorded."""
+    """Lengths of runs; the defaults are those of the stored records.
+
+    Attributes:
+        steps: Live: maximum number of environment steps.
+        updates_per_episode: Live: gradient steps after each episode.
+        interval: Live: environment steps between evaluations.
+        episodes: Recorded: number of episodes.
+        updates: Recorded: number of gradient steps.
+        eval_episodes: Episodes of each evaluation during learning.
+        final_episodes: Episodes of the evaluation at the end.
+    """
 
     steps: int = 40_000
     updates_per_episode: int = 25
@@ -103,19 +113,25 @@ def cells() -> list[Cell]:
 
 
 def evaluate(learner: indicator.Learner, robot: HostFetch, episodes: int) -> float:
-    """Return the success rate over fixed goals."""
+    """Return the success rate over ``episodes`` fixed goals; restarts the random sequence of ``robot``."""
     robot.reseed(_EVALUATION_SEED)
-    return float(np.mean([robot.episode(lambda image, goal, _: learner.act(image, goal)).is_reached for _ in range(episodes)]))
+    return float(
+        np.mean([robot.run_episode(lambda image, goal, _: learner.act(image, goal)).is_reached for _ in range(episodes)])
+    )
 
 
-def latest(metrics: list[dict[str, float]]) -> dict[str, float]:
-    """Return the means of the last updates' shares, of rewards against the truth among them."""
+def mean_shares(metrics: list[dict[str, float]]) -> dict[str, float]:
+    """Return the means over the last `_LATEST` rows of all metrics with ``share`` in their name, without ``train/``."""
     last = metrics[-_LATEST:]
     return {name.removeprefix("train/"): float(np.mean([row[name] for row in last])) for name in last[0] if "share" in name}
 
 
-def live(cell: Cell, size: Size) -> dict[str, Any]:
-    """Learn online; return success by steps."""
+def learn_online(cell: Cell, size: Size) -> dict[str, Any]:
+    """Learn online, until `IN_A_ROW` evaluations reach `TARGET_SUCCESS` or for ``size.steps`` environment steps.
+
+    Returns:
+        ``rows`` (success by environment steps), final ``success``, ``shares`` (`mean_shares`) and ``seconds``.
+    """
     learner = indicator.Learner(SHAPE, ACTION_SIZE, HORIZON, capacity=size.steps // HORIZON, **cell.options())
     robot, judge, draw = HostFetch(cell.noise, cell.seed), HostFetch(cell.noise, 0), np.random.default_rng(cell.seed)
 
@@ -126,21 +142,21 @@ def live(cell: Cell, size: Size) -> dict[str, Any]:
 
     rows, metrics, began = [], [], time.monotonic()
     for episode in range(1, size.steps // HORIZON + 1):
-        played = robot.episode(explore)
+        played = robot.run_episode(explore)
         learner.add(played.observations, played.actions, played.goal, played.states)
         metrics.append(learner.update(size.updates_per_episode))
         if episode * HORIZON % size.interval == 0:
             rows.append({"env_steps": episode * HORIZON, "success": evaluate(learner, judge, size.eval_episodes)})
-            print(cell.name, rows[-1], latest(metrics), f"{time.monotonic() - began:.0f} s", flush=True)
-            if len(rows) >= IN_A_ROW and min(row["success"] for row in rows[-IN_A_ROW:]) >= WANTED:
+            print(cell.name, rows[-1], mean_shares(metrics), f"{time.monotonic() - began:.0f} s", flush=True)
+            if len(rows) >= IN_A_ROW and min(row["success"] for row in rows[-IN_A_ROW:]) >= TARGET_SUCCESS:
                 break
     success = evaluate(learner, judge, size.final_episodes)
     for each in (robot, judge):
         each.close()
-    return {"rows": rows, "success": success, "shares": latest(metrics), "seconds": time.monotonic() - began}
+    return {"rows": rows, "success": success, "shares": mean_shares(metrics), "seconds": time.monotonic() - began}
 
 
-def record(path: Path, size: Size) -> None:
+def record_episodes(path: Path, size: Size) -> None:
     """Write episodes of the noisy behaviour as .npz, with their success, seen without noise."""
     robot, draw = HostFetch(0.0, _BEHAVIOUR_SEED), np.random.default_rng(_BEHAVIOUR_SEED)
 
@@ -149,23 +165,28 @@ def record(path: Path, size: Size) -> None:
             return draw.uniform(-1.0, 1.0, ACTION_SIZE)
         return np.append(5.0 * towards, 0.0) + 0.5 * draw.standard_normal(ACTION_SIZE)
 
-    played = [robot.episode(behave) for _ in range(size.episodes)]
+    played = [robot.run_episode(behave) for _ in range(size.episodes)]
     robot.close()
     observations, actions, goals, states, reached = (np.stack(parts) for parts in zip(*played, strict=True))
     np.savez(path, observations=observations, actions=actions, goals=goals, states=states, reached=reached)
 
 
-def recorded(cell: Cell, size: Size, folder: Path) -> dict[str, Any]:
-    """Learn offline, from recordings alone, which are made first if ``folder`` lacks them; return success."""
+def learn_offline(cell: Cell, size: Size, folder: Path) -> dict[str, Any]:
+    """Learn offline from recorded episodes, which are written first if ``folder`` lacks them.
+
+    Returns:
+        ``rows`` (success by gradient steps), final ``success``, ``behaviour_success`` of the recorded episodes, ``shares``
+        (`mean_shares`) and ``seconds``.
+    """
     path = folder / f"recorded_{size.episodes}.npz"
     if not path.exists():
-        record(path, size)
+        record_episodes(path, size)
     with np.load(path) as arrays:
         episodes = {name: arrays[name] for name in arrays.files}
     learner = indicator.Learner(SHAPE, ACTION_SIZE, HORIZON, capacity=size.episodes, **cell.options())
     draw = np.random.default_rng(cell.seed)
     for number in range(size.episodes):
-        seen, goal = (with_noise(episodes[name][number], cell.noise, draw) for name in ("observations", "goals"))
+        seen, goal = (add_noise(episodes[name][number], cell.noise, draw) for name in ("observations", "goals"))
         learner.add(seen, episodes["actions"][number], goal, episodes["states"][number])
     judge, rows, metrics, began = HostFetch(cell.noise, 0), [], [], time.monotonic()
     for updates in range(100, size.updates + 1, 100):
@@ -179,14 +200,21 @@ def recorded(cell: Cell, size: Size, folder: Path) -> dict[str, Any]:
         "rows": rows,
         "success": success,
         "behaviour_success": float(np.mean(episodes["reached"])),
-        "shares": latest(metrics),
+        "shares": mean_shares(metrics),
         "seconds": time.monotonic() - began,
     }
 
 
 def run(cell: Cell, size: Size, results: Path, recordings: Path) -> None:
-    """Run one cell and write its record."""
-    result = live(cell, size) if cell.mode == "live" else recorded(cell, size, recordings)
+    """Run one cell and write its record, ``NAME.json``.
+
+    Args:
+        cell: The cell.
+        size: Lengths of the run.
+        results: Folder of the record; created if it does not exist.
+        recordings: Existing folder of the recorded episodes.
+    """
+    result = learn_online(cell, size) if cell.mode == "live" else learn_offline(cell, size, recordings)
     about = {
         **dataclasses.asdict(cell),
         "size": dataclasses.asdict(size),
@@ -200,7 +228,7 @@ def run(cell: Cell, size: Size, results: Path, recordings: Path) -> None:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run the cells that have no record."""
+    """Run the cells that have no record; return the exit status, 2 after an error line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cells", nargs="+", help="cells by name; all if not given")
     parser.add_argument("--list", action="store_true", help="print the names of all cells")

@@ -33,7 +33,7 @@ MORE_ITERATIONS = (8, 12)
 Iterations = Literal["task", "more"]
 
 
-class Visited(NamedTuple):
+class VisitedStates(NamedTuple):
     """N states of episodes, float32: all inputs of a physics step."""
 
     qpos: np.ndarray  # [N, nq]
@@ -46,7 +46,7 @@ class Visited(NamedTuple):
 
 def visited_states(
     mj_model: mujoco.MjModel, starts: np.ndarray, controls: np.ndarray, every: int, mocap: np.ndarray | None = None
-) -> Visited:
+) -> VisitedStates:
     """Roll out C MuJoCo and return the visited states.
 
     Args:
@@ -55,6 +55,9 @@ def visited_states(
         controls: [S, T, nu], each held for ``every`` physics steps.
         every: Physics steps per control; the state before each control is returned.
         mocap: [S, T, 3], positions of the only mocap body, held as the controls are.
+
+    Returns:
+        The S T states before each control, start by start.
     """
     states = []
     data = mujoco.MjData(mj_model)
@@ -65,12 +68,12 @@ def visited_states(
             data.ctrl[:] = control
             if mocap is not None:
                 data.mocap_pos[0] = mocap[row, time]
-            states.append([getattr(data, field).astype(np.float32) for field in Visited._fields])
+            states.append([getattr(data, field).astype(np.float32) for field in VisitedStates._fields])
             mujoco.mj_step(mj_model, data, every)
-    return Visited(*(np.stack(part) for part in zip(*states)))
+    return VisitedStates(*(np.stack(part) for part in zip(*states)))
 
 
-def fetch_states(env: Any) -> Visited:
+def fetch_states(env: Any) -> VisitedStates:
     """Visit states with half of the targets in the air, and half that press the fingers onto the table."""
     start, rng = env.sample_start(jax.random.key(0)), np.random.default_rng(0)
     targets = np.asarray(start.xpos[env.mj_model.body("gripper").id]) + rng.uniform(-0.15, 0.15, (24, 10, 3))
@@ -79,7 +82,7 @@ def fetch_states(env: Any) -> Visited:
     return visited_states(env.mj_model, starts, np.zeros((24, 10, 0)), every=13, mocap=targets)
 
 
-def push_states(env: Any) -> Visited:
+def push_states(env: Any) -> VisitedStates:
     """Visit states with the gripper starting beside a face of the box, which it pushes or misses."""
     rng = np.random.default_rng(0)
     start = env.sample_start(jax.random.key(0))
@@ -94,14 +97,14 @@ def push_states(env: Any) -> Visited:
     return visited_states(env.mj_model, starts, np.zeros((24, 10, 0)), every=13, mocap=targets)
 
 
-def finger_states(env: Any) -> Visited:
+def finger_states(env: Any) -> VisitedStates:
     """Visit states under random torques from 24 initial states."""
     starts = environments.reset(env, jax.random.split(jax.random.key(3), 24))[0].data.qpos
     held = np.repeat(np.random.default_rng(0).uniform(-1, 1, (24, 10, 2)), 5, axis=1)
     return visited_states(env.mj_model, np.asarray(starts, np.float64), held, every=7)
 
 
-def hand_states(env: Any) -> Visited:
+def hand_states(env: Any) -> VisitedStates:
     """Visit states with every joint driven to a random end of its range."""
     low, high = env.mj_model.actuator_ctrlrange.T
     controls = low + (high - low) * np.random.default_rng(0).integers(0, 2, (8, 12, 20))
@@ -109,7 +112,7 @@ def hand_states(env: Any) -> Visited:
     return visited_states(env.mj_model, np.tile(start, (8, 1)), controls, every=17)
 
 
-def reacher_states(env: Any) -> Visited:
+def reacher_states(env: Any) -> VisitedStates:
     """Visit states with half of the starts near the elbow's limit, the only constraint, on either side of it."""
     rng = np.random.default_rng(0)
     near_limit = rng.choice([-1.0, 1.0], 32) * rng.uniform(2.9, 3.1, 32)
@@ -117,7 +120,7 @@ def reacher_states(env: Any) -> Visited:
     return visited_states(env.mj_model, starts, rng.uniform(-1, 1, (64, 4, 2)), every=3)
 
 
-def sawyer_states(env: Any) -> Visited:
+def sawyer_states(env: Any) -> VisitedStates:
     """Visit states with targets distributed over the goal box."""
     rng = np.random.default_rng(0)
     targets = np.array(env.config.goal_centre) + np.array(env.config.goal_size) * rng.uniform(-0.5, 0.5, (12, 10, 3))
@@ -125,7 +128,7 @@ def sawyer_states(env: Any) -> Visited:
     return visited_states(env.mj_model, starts, np.zeros((12, 10, 0)), every=13, mocap=targets)
 
 
-STATES: dict[str, Callable[[Any], Visited]] = {
+STATES: dict[str, Callable[[Any], VisitedStates]] = {
     "FetchPush": push_states,
     "FetchReach": fetch_states,
     "FingerTurn": finger_states,
@@ -135,8 +138,15 @@ STATES: dict[str, Callable[[Any], Visited]] = {
 }
 
 
-def our_step(env: Any, visited: Visited, iterations: Iterations) -> np.ndarray:
-    """Return our joint velocities [N, nv] after one step, with the task's solver iterations and contact accuracy, or more."""
+def our_step(env: Any, visited: VisitedStates, iterations: Iterations) -> np.ndarray:
+    """Return our joint velocities [N, nv] float32 after one step.
+
+    Args:
+        env: The task.
+        visited: N states.
+        iterations: ``task`` for the task's solver iterations and contact accuracy, ``more`` for `MORE_ITERATIONS` with exact
+            contacts.
+    """
     mj_model = env.mj_model
     if iterations == "more":
         mj_model = copy.copy(mj_model)
@@ -144,7 +154,7 @@ def our_step(env: Any, visited: Visited, iterations: Iterations) -> np.ndarray:
     model, still = mjx.put_model(mj_model), mjx_model.still_data(mj_model)
     exact = iterations == "more" or env.exact_contacts
 
-    def step(visited: Visited) -> jax.Array:
+    def step(visited: VisitedStates) -> jax.Array:
         return mjx_model.take_steps(model, still.replace(**visited._asdict()), 1, exact).qvel
 
     return np.asarray(jaxrl_vis_envs.jit(jax.vmap(step))(jax.tree.map(jnp.asarray, visited)))
@@ -157,7 +167,7 @@ class MujocoStep(NamedTuple):
     contacts: np.ndarray  # [N], number of contacts
 
 
-def mujoco_step(mj_model: mujoco.MjModel, visited: Visited, weld_term: bool) -> MujocoStep:
+def mujoco_step(mj_model: mujoco.MjModel, visited: VisitedStates, weld_term: bool) -> MujocoStep:
     """Take one step of C MuJoCo, with as many solver iterations as it needs.
 
     Args:
@@ -171,27 +181,27 @@ def mujoco_step(mj_model: mujoco.MjModel, visited: Visited, weld_term: bool) -> 
     qvel, contacts = np.empty((len(visited.qvel), mj_model.nv)), np.zeros(len(visited.qvel), int)
     data = mujoco.MjData(exact)
     for index, row in enumerate(zip(*visited)):
-        for field, value in zip(Visited._fields, row):
+        for field, value in zip(VisitedStates._fields, row):
             getattr(data, field)[:] = value
         if weld_term or mj_model.neq == 0:
             mujoco.mj_step(exact, data)
         else:
             assert exact.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
             mujoco.mj_step1(exact, data)
-            _take_weld_term_away(data)
+            _remove_weld_term(data)
             mujoco.mj_step2(exact, data)
         qvel[index], contacts[index] = data.qvel, data.ncon
     return MujocoStep(qvel, contacts)
 
 
-def _take_weld_term_away(data: mujoco.MjData) -> None:
+def _remove_weld_term(data: mujoco.MjData) -> None:
     """Set the reference accelerations of equality constraints to MJX's, without the derivative of their Jacobians; in place."""
     rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
     stiffness, damping, impedance, _ = data.efc_KBIP[rows].T
     data.efc_aref[rows] = -damping * data.efc_vel[rows] - stiffness * impedance * data.efc_pos[rows]
 
 
-def in_bounds(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+def relative_to_bound(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     """Return the maximum difference [N] of joint velocities [N, nv], in multiples of the bound of the tests.
 
     The bound is 1e-4 of the maximum velocity + 1e-5 (rad/s, m/s).
@@ -200,7 +210,7 @@ def in_bounds(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 
 
 def rows(name: str) -> list[str]:
-    """Return the rows of the table for one task."""
+    """Return the rows of the Markdown table for one task, a key of `STATES`."""
     env = environments.make(name)
     visited = STATES[name](env)
     steps = {iterations: our_step(env, visited, iterations) for iterations in ("task", "more")}
@@ -213,14 +223,15 @@ def rows(name: str) -> list[str]:
         theirs = mujoco_step(env.mj_model, visited, weld_term)
         truth = "C MuJoCo as it is" if weld_term else "C MuJoCo less the weld term"
         for iterations, counts in (("task", own), ("more", more)):
-            multiples = in_bounds(steps[iterations], theirs.qvel)
+            multiples = relative_to_bound(steps[iterations], theirs.qvel)
             label = ("the task's " if iterations == "task" else "") + " / ".join(map(str, counts))
-            numbers = f"{_short(np.median(multiples))} | {_short(multiples.max())} | {100 * (multiples <= 1).mean():.0f} %"
+            share = f"{100 * (multiples <= 1).mean():.0f} %"
+            numbers = f"{_format_short(np.median(multiples))} | {_format_short(multiples.max())} | {share}"
             lines.append(f"| {name} | {truth} | {label} | {len(multiples)} | {(theirs.contacts > 0).sum()} | {numbers} |")
     return lines
 
 
-def _short(number: float) -> str:
+def _format_short(number: float) -> str:
     """Format with two significant digits (one below 0.1), or as an integer from 10 on."""
     return f"{number:,.0f}" if number >= 10 else f"{number:.1g}" if number < 0.1 else f"{number:.2g}"
 

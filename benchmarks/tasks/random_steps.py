@@ -21,10 +21,15 @@ _BAD = (1e6, -1e6, jnp.inf, -jnp.inf, jnp.nan)
 
 
 def count_bad_episodes(name: str, steps: int, count: int) -> tuple[int, int]:
-    """Roll out whole episodes of ``count`` environments for at least ``steps`` steps.
+    """Roll out whole episodes of parallel environments with random and invalid actions.
+
+    Args:
+        name: Name of the task.
+        steps: Minimum number of environment steps, over all environments.
+        count: Number of parallel environments.
 
     Returns:
-        Number of steps, and number of episodes with a non-finite number.
+        Number of steps, and number of episodes with a non-finite position, velocity, achieved state or reward.
     """
     env = jaxrl_vis_envs.make(name)
 

@@ -24,7 +24,14 @@ _BATCH = 200  # parallel episodes
 
 
 def measure(name: str, episodes: int, seed: int = 0, **overrides: Any) -> tuple[float, float]:
-    """Return chance and difficulty of a task, over ``episodes`` episodes."""
+    """Return chance and difficulty of a task: success rate of uniform actions, and mean initial goal distance in thresholds.
+
+    Args:
+        name: Name of the task.
+        episodes: Number of episodes.
+        seed: Seed of starts, goals and actions.
+        **overrides: Settings of the task that differ from its defaults.
+    """
     env: Any = jaxrl_vis_envs.make(name, **overrides)
 
     def play(key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -42,7 +49,7 @@ def measure(name: str, episodes: int, seed: int = 0, **overrides: Any) -> tuple[
 
 
 def measure_hand(episodes: int, seed: int = 0) -> tuple[float, float]:
-    """Return those of HandReach, reimplemented in C MuJoCo, because the compiled program of its episodes has hung on a CPU."""
+    """Return chance and difficulty of HandReach in C MuJoCo, because the compiled program of its episodes has hung on a CPU."""
     env: Any = jaxrl_vis_envs.make("HandReach")
     model, config, generator = env.mj_model, env.config, np.random.default_rng(seed)
     tips = [model.site(name).id for name in ("fftip", "mftip", "rftip", "lftip", "thtip")]

@@ -1,7 +1,7 @@
-"""Opens the page that plays in headless Chromium and compares it with our renderer, policy and physics: `make page-check`.
+"""Open the playable page in headless Chromium and compare it with our renderer, policy and physics: `make page-check`.
 
-The site must be built, with the page's data: `make page docs`. Prints each figure with its bound. Exit status: 0 all within
-their bounds; 1 one is not, or the page does not run; 2 there is nothing to open, or nothing to open it with.
+The site must be built with the page's data: `make page docs`. Each figure is printed with its bounds. Exit status: 0 all
+figures are within their bounds; 1 one is not or is missing, or the page does not run; 2 there is no page or no browser.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-# Figure of check.js -> least and greatest value. Of images: the share of pixels with another shape, and mean levels.
+# Figure of check.js -> minimum and maximum. For images: fraction of pixels that show another shape, and mean differences.
 BOUNDS: dict[str, tuple[float, float]] = {
     "frames": (32, 32),
     "image_edges": (0, 0.002),
@@ -38,24 +38,33 @@ BOUNDS: dict[str, tuple[float, float]] = {
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """Serves the site, and receives the page's result."""
+    """Request handler that serves the site and receives the page's figures."""
 
     def __init__(self, *args: Any, results: "queue.Queue[dict[str, Any]]", **options: Any):
         self._results = results
         super().__init__(*args, **options)
 
     def do_POST(self) -> None:
-        """Take the result."""
+        """Put the figures that the page posts as JSON on the queue ``results``."""
         self._results.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
         self.send_response(204)
         self.end_headers()
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing."""
+        """Suppress the log of requests."""
 
 
 def measure(site: Path, browser: str, seconds: float) -> dict[str, Any]:
-    """Open the page and return its figures; ``error`` if it does not run."""
+    """Open the page in a browser and return its figures by name.
+
+    Args:
+        site: Folder of the built site.
+        browser: Path of a Chromium.
+        seconds: Timeout, s.
+
+    Returns:
+        The figures; only ``error``, a message, if the page posts none in time or fails.
+    """
     results: queue.Queue[dict[str, Any]] = queue.Queue()
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=str(site), results=results))
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -76,7 +85,7 @@ def measure(site: Path, browser: str, seconds: float) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Check the page."""
+    """Check the page, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--site", type=Path, default=ROOT / "build" / "site")
     parser.add_argument("--seconds", type=float, default=300, help="time that the page has")

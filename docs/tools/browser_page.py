@@ -1,11 +1,11 @@
-"""Writes what the page that plays needs, into build/play: `make page`, before `make docs`.
+"""Write the data of the playable page to build/play: `make page`, before `make docs`.
 
     vendor/       onnxruntime-web and MuJoCo's WebAssembly, from npm, at the versions and digests below
-    policy.onnx   the policy that the package calls fetch
-    task.json     its task: model, start, scene, inverse kinematics
-    golden.json   32 of its frames with our images and actions, and an episode of our physics; `browser_check.py` compares
+    policy.onnx   the shipped policy ``fetch``
+    task.json     its task: model, start state, scene, inverse kinematics
+    golden.json   32 of its frames with our images and actions, and an episode of our physics, for `browser_check.py`
 
-Nothing of it is committed. The site's build copies the folder (`hooks.py`); a site that was built without says so.
+The folder is not committed. The build of the site copies it (`hooks.py`); without it, the page shows a message.
 """
 
 import argparse
@@ -40,7 +40,7 @@ VENDORED = {
     ),
     "@mujoco/mujoco@3.14.0": ("f845a07ab81303cc6579fec07136818bed21d44a31c1911340f61e06f4d11eee", ("mujoco.js", "mujoco.wasm")),
 }
-"""Package -> SHA-256 of its archive, and the files of it that the page loads."""
+"""Package -> SHA-256 of its archive, and the files in it that the page loads."""
 LICENCES = """onnxruntime-web: MIT License, Copyright (c) Microsoft Corporation
 
 Permission is hereby granted, free of charge, to any person obtaining a copy of this software and associated documentation
@@ -59,10 +59,10 @@ OTHER DEALINGS IN THE SOFTWARE.
 
 
 def fetch_packages(folder: Path) -> None:
-    """Fetch the packages with npm, compare their digests, and unpack the files.
+    """Download `VENDORED` with npm, check the digests, and write the files and their licences to ``folder``.
 
     Raises:
-        SystemExit: npm is missing or fails, or an archive is another one.
+        SystemExit: npm is missing or fails, or an archive has another digest.
     """
     if shutil.which("npm") is None:
         sys.exit("the page needs npm to fetch onnxruntime-web and @mujoco/mujoco: install Node.js")
@@ -85,14 +85,14 @@ def fetch_packages(folder: Path) -> None:
 
 
 def describe_scene(scene: Any, moves: np.ndarray) -> dict[str, Any]:
-    """Return objects, camera and lights of a scene.
+    """Return the objects, camera and lights of a scene as JSON values.
 
     Args:
         scene: The scene.
         moves: [ngeom] bool, geoms that joints move.
 
     Raises:
-        ValueError: The scene has something that renderer.js does not draw.
+        ValueError: The scene has something that renderer.js does not render.
     """
     plain = scene.headlight and not any((*scene.light_highlights, *scene.light_shadows, *scene.transparent))
     directional = all(kind == 1 for kind in scene.light_types) and scene.camera_mount.mode == 0 == scene.camera_mount.body
@@ -125,7 +125,7 @@ def describe_scene(scene: Any, moves: np.ndarray) -> dict[str, Any]:
 
 
 def describe_task(env: Any) -> dict[str, Any]:
-    """Return model, start, goals and inverse kinematics of VisualFetchReach."""
+    """Return the model, start state, goals, inverse kinematics and scene of VisualFetchReach as JSON values."""
     mj_model, start = env.mj_model, env.sample_start(jax.random.key(0))
     hand, grip = mj_model.body("gripper").id, mj_model.site("grip").id
     chain = mjx_model.ancestor_joints(mj_model, hand)
@@ -163,7 +163,12 @@ _STATE = ("qpos", "qvel", "mocap_pos", "mocap_quat", "qacc_warmstart")
 
 
 def record_golden(policy: Any) -> dict[str, Any]:
-    """Play episodes; return frames with poses, images and actions, and the first episode's actions and grip positions."""
+    """Roll out `EPISODES` episodes of a policy.
+
+    Returns:
+        JSON values: ``frames``, `FRAMES` of them with poses, images (base64) and actions; and ``actions`` and ``grips``, the
+        actions and grip positions (m) of the first episode.
+    """
     env = policy.env
 
     def play(key: jax.Array) -> Any:
@@ -199,7 +204,7 @@ def record_golden(policy: Any) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Write the folder."""
+    """Write the data of the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=BUILT)
     out: Path = parser.parse_args().out

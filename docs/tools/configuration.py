@@ -1,4 +1,4 @@
-"""Writes the tables of docs/configuration.md from `jaxrl_vis.config`; a test fails where the page is not what this writes.
+"""Write the tables of docs/configuration.md from `jaxrl_vis.config`; a test fails if the page is out of date.
 
 python docs/tools/configuration.py
 """
@@ -14,21 +14,21 @@ BEGIN, END = "<!-- fields: begin -->\n", "<!-- fields: end -->\n"
 LAST = "<!-- tasks: end -->"
 
 
-def _shown(value: object) -> str:
+def _format_value(value: object) -> str:
     if isinstance(value, tuple):
         return " ".join(map(str, value)) or "none"
     return f"{value:,}" if type(value) is int and value >= 10_000 else str(value)
 
 
-def _default(name: str) -> str:
-    """Format the value of ``fast``, and after it those of presets that differ."""
+def _format_defaults(name: str) -> str:
+    """Format the value of an option in the preset ``fast``, followed by those of presets that differ."""
     values = {preset: config.value(name) for preset, config in PRESETS.items()}
-    others = [f"{preset}: {_shown(value)}" for preset, value in values.items() if value not in (values["fast"], preset)]
-    return "<br>".join([f"**{_shown(values['fast'])}**", *others])
+    others = [f"{preset}: {_format_value(value)}" for preset, value in values.items() if value not in (values["fast"], preset)]
+    return "<br>".join([f"**{_format_value(values['fast'])}**", *others])
 
 
-def table() -> str:
-    """Return the tables of all options, group by group."""
+def option_tables() -> str:
+    """Return the tables of all options in Markdown, group by group."""
     lines: list[str] = []
     group = ""
     for field, text in describe_options(Config):
@@ -39,12 +39,12 @@ def table() -> str:
         allowed = fields.choices(field.hint)
         choices = f" One of {', '.join(f'`{choice}`' for choice in allowed)}." if allowed else ""
         mark = " ↻" if RESUMABLE in field.extras else ""
-        lines.append(f"| `{field.name}`{mark} | {_default(field.name)} | {text}{choices} |".replace("  ", " "))
+        lines.append(f"| `{field.name}`{mark} | {_format_defaults(field.name)} | {text}{choices} |".replace("  ", " "))
     return "\n".join([*lines[1:], ""])
 
 
-def of_tasks() -> str:
-    """Return the table of the values that presets have otherwise for some tasks."""
+def task_table() -> str:
+    """Return the table of the task-specific values of presets, in Markdown."""
     lines = [
         "## Task-specific values of presets",
         "",
@@ -55,7 +55,7 @@ def of_tasks() -> str:
     ]
     for (preset, task), values in TASKS.items():
         cells = (values.always, values.images, values.oracle, values.images_and_oracle)
-        shown = (", ".join(f"`{name}` **{_shown(value)}**" for name, value in cell.items()) for cell in cells)
+        shown = (", ".join(f"`{name}` **{_format_value(value)}**" for name, value in cell.items()) for cell in cells)
         lines.append(f"| `{preset}` | {task}, Visual{task} | {' | '.join(shown)} |")
     return "\n".join(
         [
@@ -68,12 +68,12 @@ def of_tasks() -> str:
     )
 
 
-def page(text: str) -> str:
-    """Return the page with its tables as they are to be."""
+def update_page(text: str) -> str:
+    """Return the text of the page with up-to-date tables."""
     before, _, rest = text.partition(BEGIN)
     _, _, after = rest.partition(LAST)
-    return f"{before}{BEGIN}{table()}{END}\n{of_tasks()}{LAST}{after}"
+    return f"{before}{BEGIN}{option_tables()}{END}\n{task_table()}{LAST}{after}"
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(PAGE.read_text()))
+    PAGE.write_text(update_page(PAGE.read_text()))

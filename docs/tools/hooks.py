@@ -1,12 +1,12 @@
-"""What mkdocs needs to know about these pages, which are read in the checkout as well as on the site.
+"""Hooks of mkdocs for pages that are read in the checkout as well as on the site.
 
-Links that leave docs/ (to a notebook, a record, a test) work in the checkout. The site does not hold these files, so there
-the path takes the place of the link.
+Links that leave docs/ (to a notebook, a record, a test) work in the checkout. The site does not contain these files, so a link
+is replaced by its path there.
 
-Columns of tables get no narrower than their text can be read in: `site.css` looks for the class ``long``. Long names in code
-may be broken at their dots and underscores. On a phone, rows of wide tables are shown as cards.
+Table columns with long text have a minimum width: `site.css` selects the class ``long``. Long names in code may be broken at
+their dots and underscores. On a phone, rows of wide tables are shown as cards.
 
-The page that plays has its libraries and its policy from `browser_page.py`, if that was run before.
+The libraries and the policy of the playable page are copied from the output of `browser_page.py`, if it was run before.
 
 Search runs in a worker, which browsers refuse to start from a file: a page without a server starts one from the worker's text.
 """
@@ -20,7 +20,7 @@ from typing import Any
 
 
 def name_files_outside(markdown: str, depth: int = 0) -> str:
-    """Replace ``[text](../path)``, a link out of docs/, by ``text``, and the path in code unless the text names it already.
+    """Replace each link out of docs/, ``[text](../path)``, by its text and path in code, or by the path if that is the text.
 
     Args:
         markdown: Text of a page.
@@ -28,15 +28,15 @@ def name_files_outside(markdown: str, depth: int = 0) -> str:
     """
     link_out_of_docs = re.compile(rf"(?<!!)\[([^\]]+)\]\((?:\.\./){{{depth + 1}}}([^)#]+)\)")
 
-    def named(link: re.Match[str]) -> str:
+    def replacement(link: re.Match[str]) -> str:
         text, path = link.group(1).strip("`"), link.group(2)
         return f"`{path}`" if text == path else f"{text} (`{path}`)"
 
-    return link_out_of_docs.sub(named, markdown)
+    return link_out_of_docs.sub(replacement, markdown)
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Called by mkdocs for the text of every page."""
+    """Replace links out of docs/ in the Markdown of a page, unless it is generated from code (hook of mkdocs)."""
     uri = page.file.src_uri
     return markdown if uri.startswith("api/") else name_files_outside(markdown, uri.count("/"))
 
@@ -46,7 +46,7 @@ _LONG_TEXT, _LONG_NAME = 40, 20  # letters
 
 
 def fit_cells(content: str) -> str:
-    """HTML with a class for cells that hold sentences, and with places in long names of code where a line may end."""
+    """Return HTML in which table cells with long text have the class ``long`` and long names in code may be broken."""
 
     def breakable(code: re.Match[str]) -> str:
         parts = re.split(r"(\s+)", code[1])
@@ -71,9 +71,10 @@ _ROW = re.compile(r"<tr>(.*?)</tr>", re.DOTALL)
 
 
 def label_cells(content: str) -> str:
-    """Give wide tables of HTML from `fit_cells` the attribute ``data-cards``, and each of their cells its column's title.
+    """Return HTML from `fit_cells` in which wide tables have the attribute ``data-cards`` and their cells ``data-label``.
 
-    On a phone, `site.css` shows a row of such a table as a card: one line per cell, which begins with the title.
+    On a phone, `site.css` shows a row of such a table as a card: one line per cell, which begins with the label, the
+    title of its column. Tables are wide if they have at least three columns and a long cell.
     """
 
     def labelled(table: re.Match[str]) -> str:
@@ -93,7 +94,7 @@ def label_cells(content: str) -> str:
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """Called by mkdocs for the HTML of every page."""
+    """Adapt the tables in the HTML of a page, unless it is generated from code (hook of mkdocs)."""
     return html if page.file.src_uri.startswith("api/") else label_cells(fit_cells(html))
 
 
@@ -108,7 +109,10 @@ _WORKER = """if (location.protocol === "file:") {
 
 
 def on_post_build(config: Any, **_: Any) -> None:
-    """Called by mkdocs when all pages are written."""
+    """Write a script that embeds the search worker, for pages opened from files (hook of mkdocs).
+
+    Also copy the data of the playable page, if they exist.
+    """
     assets = Path(config.site_dir) / "assets"
     (worker,) = (assets / "javascripts" / "workers").glob("search.*.min.js")
     (assets / "local-iframe-worker.js").write_text(_WORKER % json.dumps(worker.read_text(encoding="utf-8")), encoding="utf-8")

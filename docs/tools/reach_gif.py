@@ -1,8 +1,8 @@
-"""Draws docs/images/reach.gif: a trained policy, what it observes, and the image of its goal.
+"""Render docs/images/reach.gif: the robot under a trained policy, its depth observation, and its goal image.
 
 python docs/tools/reach_gif.py RUN_DIR [--episodes 3]
 
-The policy sees the observations of its run; the large images show the same states from the same camera.
+The policy observes images of the size of its run; the large images show the same states from the same camera.
 """
 
 import argparse
@@ -23,7 +23,7 @@ SECONDS, LAST_SECONDS = 0.06, 1.0
 
 
 def compose(panels: dict[str, np.ndarray]) -> Image.Image:
-    """Place images side by side below their captions.
+    """Place images side by side below their captions, enlarged to `SIZE`.
 
     Args:
         panels: Caption -> image [H, W] or [H, W, 3] uint8.
@@ -39,7 +39,7 @@ def compose(panels: dict[str, np.ndarray]) -> Image.Image:
 
 
 def main() -> None:
-    """Play episodes and write the file."""
+    """Roll out episodes and write the file."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("run_dir", type=Path)
     parser.add_argument("--episodes", type=int, default=3)

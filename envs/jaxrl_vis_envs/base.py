@@ -35,7 +35,7 @@ class State:
     Attributes:
         data: Physics state (`mujoco.mjx.Data` for the MuJoCo tasks).
         achieved_state: [G] float32, true value of the quantity that the goal constrains (metres or radians, see each task).
-        goal_state: [G] float32, value of that quantity in the goal image. Neither is shown to the agent.
+        goal_state: [G] float32, desired value of that quantity. Image tasks show neither to the agent.
         reward: [] float32, `goals.oracle_reward` of the two.
         done: [] float32, always 0: all episodes have the same length, and their end is a truncation.
         metrics: ``success`` ([] float32, 0 or 1), ``goal_distance`` ([] float32, unit of the state), and any others listed in
@@ -99,7 +99,10 @@ class GoalEnv(abc.ABC):
         """Start an episode: sample a start and a goal, and fill in `State.obs`.
 
         Args:
-            key: Typed JAX key, [].
+            key: One typed JAX key.
+
+        Raises:
+            ValueError: ``key`` is a seed, or a batch of keys (`check_key`).
         """
 
     @abc.abstractmethod
@@ -124,7 +127,7 @@ class GoalEnv(abc.ABC):
 
     @property
     def converts_goals(self) -> bool:
-        """Return True if `as_goal` changes observations: if they stack images, or contain more than the goal constrains."""
+        """True if `as_goal` changes observations: if they stack images, or contain more than the goal constrains."""
         return self.frame_stack > 1
 
     def as_goal(self, frame: jax.Array) -> jax.Array:

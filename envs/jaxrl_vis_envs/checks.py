@@ -20,7 +20,7 @@ class CheckedConfig:
 
 
 def integers(config: Any, *fields: str, minimum: int = 1) -> None:
-    """Check that fields are integers of at least ``minimum``."""
+    """Check that fields are integers of at least ``minimum``; raise ValueError otherwise."""
     for field in fields:
         value = getattr(config, field)
         if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < minimum:
@@ -28,7 +28,7 @@ def integers(config: Any, *fields: str, minimum: int = 1) -> None:
 
 
 def positive(config: Any, *fields: str) -> None:
-    """Check that fields are finite numbers above 0."""
+    """Check that fields are finite numbers above 0; raise ValueError otherwise."""
     for field in fields:
         value = getattr(config, field)
         if not is_finite(value) or value <= 0:
@@ -36,7 +36,7 @@ def positive(config: Any, *fields: str) -> None:
 
 
 def not_negative(config: Any, *fields: str) -> None:
-    """Check that fields are finite numbers of at least 0."""
+    """Check that fields are finite numbers of at least 0; raise ValueError otherwise."""
     for field in fields:
         value = getattr(config, field)
         if not is_finite(value) or value < 0:
@@ -44,7 +44,7 @@ def not_negative(config: Any, *fields: str) -> None:
 
 
 def boolean(config: Any, *fields: str) -> None:
-    """Check that fields are bools."""
+    """Check that fields are bools; raise ValueError otherwise."""
     for field in fields:
         value = getattr(config, field)
         if not isinstance(value, bool):
@@ -52,14 +52,14 @@ def boolean(config: Any, *fields: str) -> None:
 
 
 def choice(config: Any, field: str, choices: Iterable[str]) -> None:
-    """Check that a field is among ``choices``."""
+    """Check that a field is among ``choices``; raise ValueError otherwise."""
     value, choices = getattr(config, field), tuple(choices)
     if value not in choices:
         raise ValueError(f"{field} must be one of {', '.join(choices)}, got {value!r}")
 
 
 def vector(config: Any, field: str, size: int) -> Sequence[float]:
-    """Check that a field holds ``size`` finite numbers, and return it."""
+    """Check that a field is a sequence of ``size`` finite numbers, and return it; raise ValueError otherwise."""
     value = getattr(config, field)
     if not isinstance(value, Sequence) or len(value) != size or not all(map(is_finite, value)):
         raise ValueError(f"{field} must be {size} finite numbers, got {value!r}")

@@ -35,7 +35,7 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
 
 
 def read_text(path: Path, max_bytes: int = MAX_BYTES) -> str:
-    """Read a file of at most ``max_bytes`` bytes of UTF-8, without a byte order mark.
+    """Read a UTF-8 file of at most ``max_bytes`` bytes; drop a byte order mark.
 
     Raises:
         OSError: The file cannot be read or is not a regular file.
@@ -52,7 +52,7 @@ def read_json(path: Path, max_bytes: int = MAX_BYTES) -> Any:
 
     Raises:
         OSError: The file cannot be read or is not a regular file.
-        ValueError: It is larger, not JSON, or nested deeper than `MAX_DEPTH`.
+        ValueError: It is larger, not UTF-8, not JSON, or nested deeper than `MAX_DEPTH`.
     """
     return parse_json(read_text(path, max_bytes))
 
@@ -70,7 +70,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     """Parse TOML.
 
     Raises:
-        ValueError: It is not TOML, or nested deeper than `MAX_DEPTH`.
+        ValueError: It is not TOML, is nested deeper than `MAX_DEPTH`, or has a line with more than 200 dots.
     """
     if any(line.count(".") > _MAX_DOTS for line in text.splitlines()):
         raise ValueError(f"more than {_MAX_DOTS} dots in a line")

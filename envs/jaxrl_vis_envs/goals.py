@@ -80,8 +80,8 @@ def indicator_reward(
         num_axes: Number of axes of one observation: 3 for images, 1 for state vectors.
         tolerance: Difference up to which two elements count as equal, in their unit (grey levels for images).
         share: Fraction of the elements that must be equal.
-        compared: bool, broadcastable to ``goal``, True for the elements to compare; None for all. If none is, the reward is
-            negative.
+        compared: bool, broadcastable to ``goal``, True for the elements to compare; None for all. If it is False
+            everywhere, the reward is ``negative``.
 
     Returns:
         [...] float32.

@@ -109,7 +109,7 @@ KINDS: dict[str, dict[str, float]] = {
     "colours": dict(colour=0.1),
     "dynamics": dict(mass=0.2, damping=0.2, friction=0.3, actuator_gain=0.1, action_scale=0.1),
 }
-"""Typical ranges: the uncertainty left after carefully measuring a real robot cell."""
+"""Typical ranges by kind: the uncertainty left after carefully measuring a real robot cell."""
 
 
 def typical(*kinds: str, strength: float = 1.0) -> Randomization:
@@ -132,7 +132,7 @@ def sample(key: jax.Array, ranges: Randomization, model: Any, action_size: int, 
     """Sample the deviations of one episode.
 
     Args:
-        key: Typed key of the episode, []; the deviations are independent of other samples from it.
+        key: Typed key of the episode; the deviations are independent of other samples from it.
         ranges: Ranges of the deviations.
         model: The `mjx.Model`.
         action_size: Number A of components of an action.

@@ -37,7 +37,7 @@ _ENTRIES: dict[str, _Entry] = {}
 
 
 class UnknownEnvironmentError(ValueError):
-    """Error for an environment name that does not exist."""
+    """Error for a name that is not, or not uniquely, that of a complete environment."""
 
 
 class UnknownOverrideError(ValueError):
@@ -58,7 +58,7 @@ def register(name: str, factory: Callable[[Any], GoalEnv], config_class: type, s
         ValueError: The name is registered with another factory or is not a word, ``factory`` is not callable, or
             ``config_class`` is not such a dataclass.
     """
-    if not isinstance(name, str) or not name or task_modules.is_own(name):
+    if not isinstance(name, str) or not name or task_modules.is_custom(name):
         raise ValueError(f"the name of an environment must be a word without a colon, such as 'MyReach', got {name!r}")
     if not callable(factory):
         raise ValueError(f"factory of {name!r} must be a function from its configuration, got {factory!r}")
@@ -114,7 +114,7 @@ def state_variant(name: str) -> str | None:
         TaskModuleError: Its module cannot be imported.
     """
     variant = _entry(name).state_variant if has_images(name) else name
-    if variant is None or not task_modules.is_own(name) or task_modules.is_own(variant):
+    if variant is None or not task_modules.is_custom(name) or task_modules.is_custom(variant):
         return variant
     return f"{task_modules.split(name)[0]}:{variant}"
 
@@ -152,9 +152,9 @@ def load(name: str, folder: str | None = None) -> str | None:
         TaskModuleError: Its module cannot be imported.
     """
     _entry(name, folder)
-    if not task_modules.is_own(name):
+    if not task_modules.is_custom(name):
         return None
-    return task_modules.import_folder(task_modules.load(task_modules.split(name)[0], folder))
+    return task_modules.import_root(task_modules.load(task_modules.split(name)[0], folder))
 
 
 def make(name: str, **overrides: Any) -> GoalEnv:
@@ -168,7 +168,8 @@ def make(name: str, **overrides: Any) -> GoalEnv:
         UnknownEnvironmentError: There is no such environment; the message suggests the nearest names.
         UnknownOverrideError: There is no such field; the message suggests the nearest names.
         TaskModuleError: Its module cannot be imported, or the environment cannot be built.
-        ValueError: A field's value is out of range, or JAX runs in 64 bits and the environment does not support it.
+        ValueError: A field's value is out of range, the environment lacks an attribute or a method has the wrong parameters, or
+            JAX runs in 64 bits and the environment does not support it.
     """
     entry = _entry(name)
     fields = [field.name for field in dataclasses.fields(entry.config_class)]
@@ -200,7 +201,7 @@ def _build(name: str, entry: _Entry, config: Any) -> GoalEnv:
         raise
     except Exception as error:  # noqa: BLE001 - user code may raise anything
         file = inspect.getsourcefile(entry.config_class)
-        raise TaskModuleError(f"{name} cannot be built: {task_modules.blame(error, file)}") from error
+        raise TaskModuleError(f"{name} cannot be built: {task_modules.describe_error(error, file)}") from error
 
 
 def _entry(name: str, folder: str | None = None) -> _Entry:
@@ -208,7 +209,7 @@ def _entry(name: str, folder: str | None = None) -> _Entry:
         raise UnknownEnvironmentError(
             f"an environment is requested by its name, or as 'module:Name' for one of your own, not by {name!r}"
         )
-    if task_modules.is_own(name):
+    if task_modules.is_custom(name):
         module, task = task_modules.split(name)
         return _module_entry(name, task_modules.load(module, folder), task)
     if name not in _ENTRIES and name in _BUILT_IN:

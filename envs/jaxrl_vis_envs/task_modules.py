@@ -25,7 +25,7 @@ class TaskModuleError(ValueError):
     """Error for a task's module that is missing or cannot be imported. Its message is one line with the problem and a hint."""
 
 
-def is_own(name: str) -> bool:
+def is_custom(name: str) -> bool:
     """Return True if a task's name includes its module."""
     return ":" in name
 
@@ -67,6 +67,9 @@ def load(module: str, folder: str | None = None, installed: bool = False) -> Mod
         folder: Folder from which it was imported earlier; it may no longer exist. None if unknown.
         installed: Search only Python's path.
 
+    Returns:
+        The module, imported already if it was loaded before.
+
     Raises:
         TaskModuleError: The module is missing or cannot be imported, or another one of the same name is already loaded.
     """
@@ -103,7 +106,7 @@ def find(module: str, folder: str | None = None) -> Path | None:
     return next((Path(path).resolve() for path in paths), None)
 
 
-def import_folder(module: ModuleType) -> str | None:
+def import_root(module: ModuleType) -> str | None:
     """Return the folder that must be on Python's path to import a module again; None if it is installed or has no file."""
     file = _origin(module)
     if file is None or {"site-packages", "dist-packages"} & set(file.parts):
@@ -112,8 +115,8 @@ def import_folder(module: ModuleType) -> str | None:
     return str(file.parents[depth])
 
 
-def blame(error: BaseException, file: str | None) -> str:
-    """Describe an error in user code in one line: its type, its message, and the line of ``file`` that caused it."""
+def describe_error(error: BaseException, file: str | None) -> str:
+    """Describe an error in user code in one line: its type, its message, and the line of ``file``, if any, that caused it."""
     if isinstance(error, SyntaxError):
         return f"{type(error).__name__}: {error.msg} ({Path(error.filename or '?').name}, line {error.lineno})"
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
@@ -134,7 +137,7 @@ def _import(module: str, source: Path | None, file: Path | None, folder: str | N
         if source is None and missing and f"{module}.".startswith(f"{missing}."):
             raise TaskModuleError(_not_found(module, folder)) from error
         install = f"; install {missing.partition('.')[0]}" if missing else ""
-        raise TaskModuleError(f"{module} cannot be imported: {blame(error, file and str(file))}{install}") from error
+        raise TaskModuleError(f"{module} cannot be imported: {describe_error(error, file and str(file))}{install}") from error
 
 
 def _not_found(module: str, folder: str | None) -> str:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.bench.conditions import Watch
+from jaxrl_vis.bench.conditions import ConditionMonitor
 from jaxrl_vis.bench.record import Measurement, compare_and_keep, load, results_path, write_json
 from jaxrl_vis.bench.settings import Settings
 
@@ -23,7 +23,7 @@ BENCHMARKS = ("render", "physics", "env", "update", "train")
 
 
 def run(benchmark: str, results: Path | None = None, json: Path | None = None, **settings: Any) -> list[Measurement]:
-    """Run one benchmark; print and store its records.
+    """Run one benchmark; print and store its records, and return its measurements.
 
     Args:
         benchmark: One of `BENCHMARKS`.
@@ -45,7 +45,7 @@ def keep_records(
     results: Path | None = None,
     json: Path | None = None,
 ) -> list[Measurement]:
-    """Run ``measure`` while monitoring `conditions`; print and store a record of every measurement that it yields.
+    """Run ``measure`` while monitoring `conditions`; print, store and return every measurement that it yields.
 
     Args:
         benchmark: Name in the file of records.
@@ -59,10 +59,10 @@ def keep_records(
     """
     load(results_path(benchmark, results))  # fail before measuring if records cannot be stored
     measurements, records = [], []
-    device_settings, watch = settings.for_this_device(), Watch()
+    device_settings, monitor = settings.for_this_device(), ConditionMonitor()
     for measurement in measure(device_settings):
         measurements.append(measurement)
-        records.append(compare_and_keep(benchmark, measurement, results, watch.conditions()))
+        records.append(compare_and_keep(benchmark, measurement, results, monitor.conditions()))
     if json is not None:
         write_json(json, records)
     if records:

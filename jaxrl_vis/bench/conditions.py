@@ -29,7 +29,7 @@ BUSY_CORES = 0.3
 _SAMPLE_S, _CALIBRATION_S, _REPEATS = 0.4, 0.04, 5
 
 
-def machine() -> str:
+def machine_id() -> str:
     """Return an identifier of this machine: 12 hexadecimal digits, different for machines of the same name."""
     words = [platform.node()]
     for file in ("/etc/machine-id", "/var/lib/dbus/machine-id"):
@@ -120,21 +120,21 @@ def _seconds(call: Callable[[], Any]) -> float:
     return statistics.median(seconds_per_call(calls) for _ in range(_REPEATS))
 
 
-class Watch:
+class ConditionMonitor:
     """Monitor of the machine during a benchmark: ask for the conditions after each measurement."""
 
     def __init__(self) -> None:
-        self._busy, self._before = busy_cores(), calibrate()
+        self._busy_cores, self._calibration = busy_cores(), calibrate()
         self._cores = num_cores()
 
     def conditions(self) -> dict[str, Any]:
         """Return the conditions of a record: machine, cores, load before the benchmark, and calibrations around it."""
-        before, self._before = self._before, calibrate()
+        before, self._calibration = self._calibration, calibrate()
         return {
-            "machine": machine(),
+            "machine": machine_id(),
             "cores": self._cores,
-            "busy_cores": self._busy,
-            "calibration": {"before": before, "after": self._before},
+            "busy_cores": self._busy_cores,
+            "calibration": {"before": before, "after": self._calibration},
         }
 
 
@@ -142,7 +142,7 @@ def comparison_fault(new: dict[str, Any] | None, old: dict[str, Any] | None) -> 
     """Return the reason why two results are not comparable, in words; None if they are.
 
     Args:
-        new, old: Conditions from `Watch`; None for a record without conditions.
+        new, old: Conditions from `ConditionMonitor`; None for a record without conditions.
     """
     if old is None or new is None:
         return "it does not say how fast its machine was"

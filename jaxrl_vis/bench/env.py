@@ -44,7 +44,7 @@ def time_episodes(env: GoalEnv, count: int, repeats: int) -> tuple[Timing, float
 def measure(settings: Settings) -> Iterator[Measurement]:
     """Yield environment steps per second; the time of resets and goal images is spread over the horizon."""
     env = settings.make_env()
-    for count in settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS):
+    for count in settings.batch_sizes(CPU_COUNTS, ACCELERATOR_COUNTS):
         timing, compile_s = time_episodes(env, count, settings.repeats)
         yield Measurement(
             name="env/steps",

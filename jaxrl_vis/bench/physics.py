@@ -24,10 +24,15 @@ def start_states(env: GoalEnv, count: int) -> State:
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yield environment steps per second for each batch size."""
+    """Yield environment steps per second for each batch size.
+
+    Raises:
+        AssertionError: Environments behave alike.
+        FloatingPointError: A final state is not finite.
+    """
     env = settings.make_env()
     steps = env.horizon if settings.on_accelerator else 10
-    counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
+    counts = settings.batch_sizes(CPU_COUNTS, ACCELERATOR_COUNTS)
     # One program creates all initial states; smaller batches use the first of them.
     states = start_states(env, max(counts))
 

@@ -141,7 +141,7 @@ def compare_and_keep(
         benchmark: Name of the benchmark.
         measurement: Measurement to store.
         folder: Folder of records; None for `user_folder`.
-        conditions: See `conditions.Watch`.
+        conditions: See `conditions.ConditionMonitor`.
     """
     record = to_record(measurement, conditions)
     print(describe(record, keep(results_path(benchmark, folder), record)), flush=True)

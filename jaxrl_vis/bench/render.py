@@ -28,7 +28,11 @@ _STEPS = 5  # random control steps from the common start, after which no two rob
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yield images per second for each size, output and batch: of the scene if one is set, else of the environment."""
+    """Yield images per second for each size, output and batch: of the scene if one is set, else of the environment.
+
+    Raises:
+        RequestError: The environment does not observe images, or as in `scenes.models.load`.
+    """
     if settings.scene is not None:
         yield from scene_images.measure(settings, image_sizes(settings))
         return
@@ -36,8 +40,8 @@ def measure(settings: Settings) -> Iterator[Measurement]:
         visual = registry.visual_variant(settings.env)
         hint = f": try --env {visual}" if visual else ""
         raise RequestError(f"bench render needs an environment with images, and {settings.env} has none{hint}")
-    counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
-    batches = [poses(settings, max(counts), seed) for seed in (4, 5)]
+    counts = settings.batch_sizes(CPU_COUNTS, ACCELERATOR_COUNTS)
+    batches = [random_states(settings, max(counts), seed) for seed in (4, 5)]
     for size in image_sizes(settings):
         for output in ("depth", "rgb", "rgbd") if settings.on_accelerator else ("depth", "rgbd"):
             env = settings.make_env(image_size=size, pixels=output)
@@ -63,8 +67,8 @@ def image_sizes(settings: Settings) -> tuple[int, ...]:
     return sizes
 
 
-def poses(settings: Settings, count: int, seed: int = 4) -> Any:
-    """Create states of ``count`` environments in different poses."""
+def random_states(settings: Settings, count: int, seed: int = 4) -> Any:
+    """Create states of ``count`` environments after five random control steps, without images."""
     env = settings.make_env()
 
     def scatter(state: Any, key: jax.Array) -> Any:

@@ -56,7 +56,7 @@ def head_products(sizes: tuple[int, ...]) -> int:
     return sum(first * second for first, second in zip(sizes, sizes[1:], strict=False))
 
 
-def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
+def minimum_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
     """Return a lower bound of the cost from the shapes of the layers, averaged over the actor's update interval.
 
     Products: every online encoder runs forward and backward on two images per transition (backward costs twice a forward pass,
@@ -98,7 +98,7 @@ def _bytes(tree: Any) -> int:
 
 
 def describe(cost: Cost, seconds: float, dtype: str, device_kind: str) -> dict[str, Any]:
-    """Return the achieved TFLOP/s and GB/s, with their fractions of the device's peak if that is known."""
+    """Return operations, memory traffic and the achieved TFLOP/s and GB/s, with fractions of the device's peak if known."""
     achieved = {
         "gflop": round(cost.flops / 1e9, 3),
         "mbyte": round(cost.bytes / 1e6, 3),

@@ -48,7 +48,7 @@ class Settings:
     on_accelerator: bool = False
 
     def for_this_device(self) -> Self:
-        """Fill in the defaults that depend on the device alone; each benchmark fills in its own sizes."""
+        """Return a copy with the defaults that depend on the device alone; each benchmark fills in its own sizes."""
         accelerator = jax.default_backend() != "cpu"
         return dataclasses.replace(
             self,
@@ -57,7 +57,7 @@ class Settings:
             on_accelerator=accelerator,
         )
 
-    def counts(self, cpu: tuple[int, ...], accelerator: tuple[int, ...]) -> tuple[int, ...]:
+    def batch_sizes(self, cpu: tuple[int, ...], accelerator: tuple[int, ...]) -> tuple[int, ...]:
         """Return the batch sizes to measure: the requested ones, or the defaults for this kind of device."""
         return self.envs or (accelerator if self.on_accelerator else cpu)
 

@@ -15,7 +15,7 @@ _MIN_SECONDS = 0.2
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """Duration of one call.
+    """Duration of one call, measured several times.
 
     Attributes:
         median_s: Median duration of the repeats in seconds.
@@ -28,13 +28,13 @@ class Timing:
     repeats: int
 
     def details(self, compile_s: float, **more: Any) -> dict[str, Any]:
-        """Return the details of a record: repeats, spread and seconds of compilation, with further entries."""
+        """Return the details of a record: repeats, spread, seconds of compilation, and further entries ``more``."""
         timing = {"repeats": self.repeats, "spread": round(self.spread, 4), "compile_s": round(compile_s, 2)}
         return {**timing, **more}
 
 
 def compile_timed(jitted: Any, *arguments: Any) -> tuple[Any, float]:
-    """Compile ahead of time; return the program and the seconds of tracing and compiling (few on a cache hit)."""
+    """Compile a jitted function ahead of time, for the default device; return the program and the seconds that it took."""
     start = time.perf_counter()
     with tracing_for_default_device():
         lowered = jitted.lower(*arguments)

@@ -42,15 +42,15 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
         repeats: Maximum number of timed repeats.
 
     Returns:
-        The trained state; the timing of an iteration whose metrics the host reads during the next one; and the seconds of
-        ``compile`` (compilation) and ``host`` (reading metrics).
+        The training state after these iterations; the timing of an iteration whose metrics the host reads during the next one;
+        and the seconds of ``compile`` (compilation) and ``host`` (reading metrics).
 
     Raises:
         FloatingPointError: A metric is not finite.
     """
     loop = programs.program.init(seed_keys(programs.program, 0))
     start = time.perf_counter()
-    programs.of_training()
+    programs.training_programs()
     compile_s = time.perf_counter() - start
     loop, waiting = programs.train_iteration(loop)
     pending = programs.pending(waiting)
@@ -74,7 +74,7 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
 
 
 def _wait_for_result(program: TrainStep, call: Callable[[], Any]) -> Callable[[], Any]:
-    """Wrap a call to wait for its result if several devices share a CPU's threads: two calls could deadlock."""
+    """Return ``call``, wrapped to wait for its result if several devices share a CPU's threads: two calls could deadlock."""
     if program.layout.num_devices == 1 or jax.default_backend() != "cpu":
         return call
     return lambda: jax.block_until_ready(call())
@@ -119,10 +119,10 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
     }
 
 
-def describe(iteration: float, parts: dict[str, float], predicted: float) -> str:
-    """Format a table of the parts: milliseconds, and percent of an iteration."""
-    total = parts["rollout"] + parts["insert"] + parts["updates"] + parts["host"]
-    rows = {**parts, "sum without evaluation": total, "iteration": iteration, "predicted": predicted}
+def describe(iteration: float, part_seconds: dict[str, float], predicted: float) -> str:
+    """Format a table of the parts of an iteration: milliseconds, and percent of an iteration."""
+    total = part_seconds["rollout"] + part_seconds["insert"] + part_seconds["updates"] + part_seconds["host"]
+    rows = {**part_seconds, "sum without evaluation": total, "iteration": iteration, "predicted": predicted}
     lines = [f"    {name:24}{1e3 * seconds:12,.2f} ms {seconds / iteration:8.1%}" for name, seconds in rows.items()]
     return "\n".join(lines)
 
@@ -140,7 +140,7 @@ def single_device_config(config: Config) -> Config:
     )
 
 
-def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
+def _time_single_device(env: GoalEnv, config: Config, settings: Settings) -> float:
     """Time an iteration of `single_device_config`, in seconds."""
     config_of_one = single_device_config(config)
     return time_iterations(Programs(config_of_one, make_train_step(env, config_of_one), cache=False), settings.repeats)[
@@ -149,18 +149,18 @@ def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yield the total environment steps and gradient steps per second of all seeds."""
+    """Yield the total environment steps and gradient steps per second of all seeds; print the time of each part."""
     env = settings.make_env()
-    for count in settings.counts((0,), (0,)):  # 0: the preset's number of environments
+    for count in settings.batch_sizes((0,), (0,)):  # 0: the preset's number of environments
         config = training_config(settings, **({"num_envs": count} if count else {}))
         program, started = make_train_step(env, config), time.perf_counter()
         programs = Programs(config, program, cache=False)
         loop, timing, seconds = time_iterations(programs, settings.repeats)
         parts = {**time_parts(programs, loop, settings.repeats), "host": seconds["host"]}
         del loop
-        efficiency = (
-            {} if config.run.devices == 1 else {"efficiency": round(_time_share(env, config, settings) / timing.median_s, 3)}
-        )
+        efficiency = {}
+        if config.run.devices > 1:
+            efficiency["efficiency"] = round(_time_single_device(env, config, settings) / timing.median_s, 3)
         episodes, _ = time_episodes(env, config.run.num_envs * config.run.seeds // config.run.devices, settings.repeats)
         predicted = episodes.median_s + parts["updates"]
         print(describe(timing.median_s, parts, predicted), flush=True)

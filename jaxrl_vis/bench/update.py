@@ -56,7 +56,7 @@ def seed_keys(program: TrainStep, seed: int) -> jax.Array:
     return program.layout.put(keys, program.layout.by_seed)
 
 
-def start(program: TrainStep) -> LoopState:
+def init_with_full_replay(program: TrainStep) -> LoopState:
     """Initialise learners with full replays."""
     loop = program.init(seed_keys(program, 0))
     fill = jax.jit(jax.vmap(fill_replay), donate_argnums=0)
@@ -64,7 +64,11 @@ def start(program: TrainStep) -> LoopState:
 
 
 def time_updates(program: TrainStep, loop: LoopState, repeats: int) -> tuple[Timing, float]:
-    """Time one call of ``update_many``, which donates ``loop``; return the timing and the seconds of compilation."""
+    """Time one call of ``update_many``, which donates ``loop.train``; return the timing and the seconds of compilation.
+
+    Raises:
+        AssertionError: The parameters of the actor did not change.
+    """
     keys = seed_keys(program, 2)
     compiled, compile_s = compile_timed(program.update_many, loop.train, loop.replay, keys, loop.iteration)
     train = loop.train
@@ -101,7 +105,7 @@ def measure_program(program: TrainStep, settings: Settings) -> Measurement:
         settings: Settings of the record, and the maximum number of timed repeats.
     """
     config = program.config
-    loop = start(program)
+    loop = init_with_full_replay(program)
     assert_varied(loop.replay.episodes.observations[:1, :64, :1][0, :, 0], "observations of the replay")
     timing, compile_s = time_updates(program, loop, settings.repeats)
     del loop
@@ -139,7 +143,7 @@ def _costs(program: TrainStep, seconds: float) -> dict[str, Any]:
     dtype, device = str(program.networks.dtype), jax.devices()[0].device_kind
     costs = {}
     if not config.auxiliary.aux_tasks:
-        bound = roofline.least_cost(program.networks, params, config.run.batch_size)
+        bound = roofline.minimum_cost(program.networks, params, config.run.batch_size)
         costs["roofline"] = roofline.describe(bound, seconds, dtype, device)
     if counted is not None:
         costs["compiler"] = roofline.describe(counted, seconds, dtype, device)

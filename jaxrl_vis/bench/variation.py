@@ -9,9 +9,13 @@ import numpy as np
 
 
 def assert_varied(rows: Any, label: str) -> None:
-    """Assert that [N, ...] ``rows`` are not copies: more than half of them are distinct.
+    """Assert that [N, ...] ``rows`` are not copies: more than half of them are distinct, or there is only one.
 
-    If all environments of a benchmark behave the same, it measures one environment and a broadcast.
+    If all environments of a benchmark behave the same, it measures one environment and a broadcast. ``label`` names the rows in
+    the message.
+
+    Raises:
+        AssertionError: Half of the rows or fewer are distinct.
     """
     rows = np.asarray(rows)
     count = rows.shape[0]
@@ -32,6 +36,9 @@ def assert_new_images(draw: Callable[[Any], Any], batches: list[Any]) -> None:
     Args:
         draw: Function from a batch to arrays [N, ...] or a tree of them.
         batches: Two or more batches.
+
+    Raises:
+        AssertionError: Half of the images or more are copies of others in their batch, or of the previous batch's.
     """
     drawn = [image_bytes(draw(batch)) for batch in batches]
     for rows in drawn:

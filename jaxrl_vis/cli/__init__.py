@@ -69,12 +69,12 @@ def overview(group: str = "") -> str:
     return "\n".join([*lines, "", f"`{PROGRAM} COMMAND --help` lists the options of a command."])
 
 
-def main(words: Sequence[str] | None = None, should_stop: Callable[[int], None] | None = None) -> int:
-    """Run one command. Output errors do not end it, and signals end it in order.
+def main(argv: Sequence[str] | None = None, force_exit: Callable[[int], None] | None = None) -> int:
+    """Run one command. It continues despite output errors, and shuts down gracefully on signals (see `Ending`).
 
     Args:
-        words: The command line without the program's name; None: that of this process.
-        should_stop: See `Ending`.
+        argv: Command line without the program's name; None for that of this process.
+        force_exit: See `Ending`.
 
     Returns:
         The exit status.
@@ -82,38 +82,38 @@ def main(words: Sequence[str] | None = None, should_stop: Callable[[int], None] 
     Raises:
         SystemExit: A command's help was printed.
     """
-    words = sys.argv[1:] if words is None else words
-    with safe_streams() as printed, Ending(should_stop) as ending:
+    argv = sys.argv[1:] if argv is None else argv
+    with safe_streams() as printed, Ending(force_exit) as ending:
         try:
-            status = _run_with_status(words, ending)
+            status = _run_with_status(argv, ending)
         except SystemExit as end:
             printed.flush()
             if end.code or printed.failure is None:
                 raise
             status = 0
         printed.flush()
-        return _output_status(words, printed) if status == 0 else status
+        return _output_status(argv, printed) if status == 0 else status
 
 
-def _run_with_status(words: Sequence[str], ending: Ending) -> int:
+def _run_with_status(argv: Sequence[str], ending: Ending) -> int:
     try:
-        return _command(words)()
+        return _parse_command(argv)()
     except tuple(_STATUS) as error:
         if ending.signal is not None:  # which probably went to child processes as well
-            return _ended_by(ending.signal)
+            return _report_signal(ending.signal)
         print(f"{PROGRAM}: {' '.join(str(error).splitlines())}", file=sys.stderr)
         return next(status for kind, status in _STATUS.items() if isinstance(error, kind))
     except KeyboardInterrupt:
-        return 130 if ending.signal is None else _ended_by(ending.signal)
+        return 130 if ending.signal is None else _report_signal(ending.signal)
     except Terminated as stop:  # from `Interruption`, which has reported what is saved
-        return 128 + stop.signal if ending.signal is None else _ended_by(ending.signal)
+        return 128 + stop.signal if ending.signal is None else _report_signal(ending.signal)
     except Exception as error:
         if ending.signal is not None:
-            return _ended_by(ending.signal)
+            return _report_signal(ending.signal)
         if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:  # from wherever a path was first used
             print(f"{PROGRAM}: {str(error.filename)[:80]}... cannot be used ({error.strerror})", file=sys.stderr)
             return _STATUS[RequestError]
-        if not distributed.are_several():
+        if not distributed.is_multi_process():
             raise
         traceback.print_exc()
         print(
@@ -124,14 +124,14 @@ def _run_with_status(words: Sequence[str], ending: Ending) -> int:
         return 1
 
 
-def _ended_by(number: int) -> int:
+def _report_signal(number: int) -> int:
     print(f"{PROGRAM}: {signal_name(number)}: ended before it was done", file=sys.stderr)
     return 128 + number
 
 
-def _output_status(words: Sequence[str], printed: SafeStream) -> int:
+def _output_status(argv: Sequence[str], printed: SafeStream) -> int:
     """Return the exit status of a successful command, considering errors of its output."""
-    prints_result = " ".join(words).startswith(_PRINT_RESULTS) or not words or {"-h", "--help", "--version"} & set(words)
+    prints_result = " ".join(argv).startswith(_PRINT_RESULTS) or not argv or {"-h", "--help", "--version"} & set(argv)
     if not isinstance(printed.failure, OSError) or not prints_result:
         return 0
     if isinstance(printed.failure, BrokenPipeError):  # the reader has exited: `jaxrl-vis train --help | head`
@@ -147,31 +147,31 @@ def entry() -> None:
     second signal, are not waited for.
     """
     reserve_standard_files()
-    status = main(should_stop=lambda number: os._exit(_ended_by(number)))
+    status = main(force_exit=lambda number: os._exit(_report_signal(number)))
     detach_broken_streams()
     if status == _STATUS[RequestError]:
-        distributed.leave_together()
-    if status > 128 or (status and distributed.are_several()):
+        distributed.shut_down_together()
+    if status > 128 or (status and distributed.is_multi_process()):
         os._exit(status)  # failed processes must not wait for each other
     sys.exit(status)
 
 
-def split_command(words: Sequence[str]) -> tuple[str, Sequence[str]]:
+def split_command(argv: Sequence[str]) -> tuple[str, Sequence[str]]:
     """Split a command line into the command, of one word or more, and its arguments.
 
     Args:
-        words: At least one word.
+        argv: At least one word.
 
     Raises:
         RequestError: There is no such command.
     """
-    table = COMMANDS if words[0] in COMMANDS else all_commands()
-    for count in range(len(words), 0, -1):
-        name = " ".join(words[:count])
+    table = COMMANDS if argv[0] in COMMANDS else all_commands()
+    for count in range(len(argv), 0, -1):
+        name = " ".join(argv[:count])
         if name in table:
-            return name, words[count:]
+            return name, argv[count:]
     group = ""
-    for word in words:
+    for word in argv:
         choices = _next_words(group, table)
         if word not in choices:
             kind = "option" if word.startswith("-") and not group else "command"
@@ -186,24 +186,24 @@ def _next_words(group: str, table: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(name.removeprefix(group).split()[0] for name in table if name.startswith(group)))
 
 
-def _command(words: Sequence[str]) -> Callable[[], int]:
-    """Read a command line, and return the command with its options; after help, nothing is left to do."""
-    if not words:
+def _parse_command(argv: Sequence[str]) -> Callable[[], int]:
+    """Parse a command line, and return the function that runs the command; after printing help, one that does nothing."""
+    if not argv:
         first = ", ".join(_next_words("", all_commands()))
         raise RequestError(f"no command given; choose one of {first} (or see {PROGRAM} --help)")
-    if words[0] in ("-h", "--help", "--version"):
-        print(jaxrl_vis.__version__ if words[0] == "--version" else overview())
-        return _nothing
-    if words[-1] in ("-h", "--help") and words[0] not in COMMANDS:
-        group = " ".join(words[:-1])
+    if argv[0] in ("-h", "--help", "--version"):
+        print(jaxrl_vis.__version__ if argv[0] == "--version" else overview())
+        return _do_nothing
+    if argv[-1] in ("-h", "--help") and argv[0] not in COMMANDS:
+        group = " ".join(argv[:-1])
         names = all_commands()
         if group not in names and any(name.startswith(f"{group} ") for name in names):
             print(overview(f"{group} "))
-            return _nothing
-    name, rest = split_command(words)
+            return _do_nothing
+    name, rest = split_command(argv)
     command, run = (COMMANDS if name in COMMANDS else all_commands())[name]
     return functools.partial(run, parse(command, rest, name))
 
 
-def _nothing() -> int:
+def _do_nothing() -> int:
     return 0

@@ -75,6 +75,6 @@ def run(options: Audit) -> int:
         print(options.out)
     if options.json is not None:
         asked = {key: value for key, value in dataclasses.asdict(options).items() if key not in ("out", "json", "trust")}
-        record = {"audit": asked, "device": report.devices(), "pairs": len(pairs.distance), "rewards": records}
+        record = {"audit": asked, "device": report.device_kind(), "pairs": len(pairs.distance), "rewards": records}
         write_atomically(options.json, json.dumps(record, indent=2) + "\n")
     return 0

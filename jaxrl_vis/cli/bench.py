@@ -11,7 +11,7 @@ from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.config import Pixels
 from jaxrl_vis.config.methods import AuxTaskName, WeightingName
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.host.devices import check_devices, claim_memory, count_devices
+from jaxrl_vis.host.devices import check_devices, claim_memory, parse_device_count
 from jaxrl_vis.report.outputs import check_writable
 
 Benchmark = Literal["render", "physics", "env", "update", "train"]
@@ -44,7 +44,7 @@ class Bench:
     data_devices: int | None = None
     """Number of devices that share each learner; all of them if there is one seed, else one (train)."""
     repeats: int = 5
-    """Timed repeats; the median counts."""
+    """Maximum number of timed repeats; the median is reported."""
     aux_tasks: tuple[AuxTaskName, ...] = ()
     """Auxiliary tasks in the gradient steps (update, train)."""
     weighting: WeightingName = "none"
@@ -92,6 +92,6 @@ def run(options: Bench) -> int:
     check_devices()
     check_writable(options.results or user_folder(), "--results", folder=True)
     settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
-    settings["devices"] = 1 if options.devices is None else count_devices(options.devices)
+    settings["devices"] = 1 if options.devices is None else parse_device_count(options.devices)
     bench.run(**settings)
     return 0

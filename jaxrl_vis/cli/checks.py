@@ -54,7 +54,7 @@ def may_run_code(run_dir: Path, trust: bool) -> bool:
     except RequestError:  # reported when the run is used, before any of its code runs
         return trust
     if not trust and trusting.is_own(config) and not trusting.is_trusted(run_dir, config) and _is_at_terminal():
-        print(f"{trusting.question(run_dir, config)}. Run it? [y/N] ", end="", file=sys.stderr, flush=True)
+        print(f"{trusting.describe_code(run_dir, config)}. Run it? [y/N] ", end="", file=sys.stderr, flush=True)
         trust = sys.stdin.readline().strip().lower() in ("y", "yes")
     trusting.check(run_dir, config, trust, "pass --trust")
     return trust

@@ -13,7 +13,7 @@ class Doctor:
 
 
 def run(options: Doctor) -> int:
-    """Check the installation; return 1 if something fails."""
+    """Check the installation; return the exit status of `doctor.main`."""
     if options.report is None:
         from jaxrl_vis.host import doctor
 

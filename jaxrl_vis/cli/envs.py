@@ -40,6 +40,6 @@ def run(options: Envs) -> int:
         gallery.check_gallery(options.gallery, names)
     gallery.print_table(names)
     if options.gallery is not None:
-        gallery.draw(options.gallery, names, options.image_size, options.goals)
+        gallery.write_gallery(options.gallery, names, options.image_size, options.goals)
         print(options.gallery)
     return 0

@@ -102,7 +102,7 @@ def _draw_example(options: Figure) -> int:
 
 
 def _request(options: Figure, out: Path) -> "Request":
-    """Make the request for a figure from the options.
+    """Build the request for a figure from the options.
 
     Raises:
         RequestError: An option is invalid.

@@ -27,7 +27,7 @@ from jaxrl_vis.errors import RequestError, nearest
 PROGRAM = "jaxrl-vis"
 
 # Options of brax, Stable-Baselines3, its zoo and CleanRL that users may try -> the equivalent here.
-_ELSEWHERE = {
+_FOREIGN_OPTIONS = {
     **dict.fromkeys(
         ("--cuda", "--no-cuda", "--device", "--gpu", "--cpu"),
         "JAX takes the accelerator that it finds; the environment variable JAX_PLATFORMS=cpu, cuda or tpu chooses",
@@ -69,10 +69,10 @@ class DefaultText:
     """Annotation of a field whose default is described by a function.
 
     Attributes:
-        words: Returns the description for the help.
+        describe: Function that returns the description for the help.
     """
 
-    words: Callable[[], str]
+    describe: Callable[[], str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +87,7 @@ class _Option:
         default: Description of its default in the help; empty if obvious.
         required: True if it must be given.
         changes: Field of the command that collects it; None if it is a field of the command itself.
-        twin: True for the positional form of a field that is also an option.
+        is_positional_form: True for the positional form of a field that is also an option.
     """
 
     name: str
@@ -97,12 +97,12 @@ class _Option:
     default: str
     required: bool
     changes: str | None = None
-    twin: bool = False
+    is_positional_form: bool = False
 
     @property
     def key(self) -> str:
         """Key of the option for tyro."""
-        return f"{self.name}_by_place" if self.twin else self.name
+        return f"{self.name}_by_place" if self.is_positional_form else self.name
 
     @property
     def flag(self) -> str:
@@ -177,8 +177,8 @@ def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
         flags = [option.flag for option in options.values() if not option.positional]
         if word == "--version":
             raise RequestError(f"--version goes without a command: {PROGRAM} --version")
-        if word in _ELSEWHERE and word not in flags:
-            raise RequestError(f"unknown option {word}: {_ELSEWHERE[word]}")
+        if word in _FOREIGN_OPTIONS and word not in flags:
+            raise RequestError(f"unknown option {word}: {_FOREIGN_OPTIONS[word]}")
         raise RequestError(f"unknown option {word}{nearest(word, flags, f'see {program} --help')}")
     values: dict[str, Any] = {}
     for key, option in options.items():
@@ -202,7 +202,7 @@ def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
 def _split(
     command: type, program: str, words: Sequence[str], options: dict[str, _Option]
 ) -> tuple[dict[str, Any], Sequence[str]]:
-    """Split arguments into the words of each given option (or True and False for flags), and the words of none."""
+    """Split arguments into the words of each given option (True or False for flags) and the remaining words."""
     # A dictionary with optional keys: tyro omits options that were not given.
     annotations = {name: option.annotation() for name, option in options.items()}
     form: Any = typing.TypedDict(command.__name__, annotations, total=False)  # pyright: ignore[reportArgumentType]
@@ -275,10 +275,10 @@ def _collect_options(command: type) -> list[_Option]:
             required = field.default is dataclasses.MISSING
             default = "required" if required else f"default: {field.default}" if field.default else ""
             for extra in field.extras:
-                default = extra.words() if isinstance(extra, DefaultText) else default
+                default = extra.describe() if isinstance(extra, DefaultText) else default
             if AlsoPositional() in field.extras:
                 options.append(_Option(field.name, field.hint, False, text, "" if required else default, False))
-                options.append(_Option(field.name, field.hint, True, text, default, required, twin=True))
+                options.append(_Option(field.name, field.hint, True, text, default, required, is_positional_form=True))
                 continue
             positional = tyro.conf.Positional in field.extras
             options.append(_Option(field.name, field.hint, positional, text, default, required))

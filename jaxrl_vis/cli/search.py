@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.figure import UNFINISHED
 from jaxrl_vis.cli.parsing import AlsoPositional, DefaultText, FieldsOf
-from jaxrl_vis.cli.train import default_preset, describe_default
+from jaxrl_vis.cli.train import describe_default, describe_default_preset
 from jaxrl_vis.config import PRESETS, Config, preset, validate
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.host.devices import guess_accelerator
@@ -30,7 +30,7 @@ class Search:
     actor_learning_rate=1e-4..1e-2,log batch_size=128,256."""
     trials: int = 20
     """Number of trials, including those of earlier starts."""
-    preset: Annotated[str, DefaultText(default_preset)] = "auto"
+    preset: Annotated[str, DefaultText(describe_default_preset)] = "auto"
     """paper, fast, cpu or debug; auto is fast on an accelerator, else cpu."""
     changes: Annotated[Mapping[str, Any], FieldsOf(Config, describe_default)] = dataclasses.field(default_factory=dict)
     runs: Path | None = None

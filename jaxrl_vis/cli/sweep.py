@@ -10,7 +10,7 @@ import tyro
 from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.figure import UNFINISHED
 from jaxrl_vis.cli.parsing import DefaultText, FieldsOf
-from jaxrl_vis.cli.train import default_preset, describe_default
+from jaxrl_vis.cli.train import describe_default, describe_default_preset
 from jaxrl_vis.config import PRESETS, Config
 from jaxrl_vis.config.methods import MethodName
 from jaxrl_vis.errors import RequestError, nearest
@@ -30,7 +30,7 @@ class Sweep:
     """Environments; VisualFetchReach if not given."""
     method: tuple[MethodName, ...] = ()
     """Methods; oracle if not given."""
-    preset: Annotated[str, DefaultText(default_preset)] = "auto"
+    preset: Annotated[str, DefaultText(describe_default_preset)] = "auto"
     """paper, fast, cpu or debug; auto is fast on an accelerator, else cpu."""
     changes: Annotated[Mapping[str, Any], FieldsOf(Config, describe_default)] = dataclasses.field(default_factory=dict)
     seeds_per_run: int | None = None

@@ -23,7 +23,7 @@ class TaskImages:
     """Random seed."""
 
     def config(self, **changes: Any) -> Config:
-        """Return the configuration of the preset `fast` with these images, and further options by name."""
+        """Return the preset ``fast`` with these images, without random shifts, and with further ``changes`` by name."""
         return preset(
             "fast",
             env=self.env,

@@ -11,17 +11,17 @@ from jaxrl_vis.cli.parsing import AlsoPositional, DefaultText, FieldsOf
 from jaxrl_vis.config import OPTIONS, PRESETS, Config, preset, validate
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.host import distributed, streams
-from jaxrl_vis.host.devices import check_devices, claim_memory, count_devices, guess_accelerator, start_devices
-from jaxrl_vis.host.plugins import own_names
+from jaxrl_vis.host.devices import check_devices, claim_memory, guess_accelerator, parse_device_count, start_devices
+from jaxrl_vis.host.plugins import custom_names
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run.loggers import group
 from jaxrl_vis.run.loggers.group import LoggerName
-from jaxrl_vis.run.storage.folder import check_there, default_folder, read_config
+from jaxrl_vis.run.storage.folder import check_resumable, default_folder, read_config
 
 
 def describe_default(name: str) -> str:
     """Describe a field's default: its value in this machine's ``auto`` preset, and the presets with other values."""
-    current = _auto(guess_accelerator())
+    current = _auto_preset(guess_accelerator())
     values = {preset_name: config.value(name) for preset_name, config in PRESETS.items()}
     words = {
         preset_name: " ".join(map(str, value)) or "none" if isinstance(value, tuple) else str(value)
@@ -31,14 +31,16 @@ def describe_default(name: str) -> str:
     return f"default: {words[current]}" + (f"; {others}" if others else "")
 
 
-def _auto(on_accelerator: bool) -> str:
-    """Return the preset for the hardware."""
+def _auto_preset(on_accelerator: bool) -> str:
+    """Return the preset that ``auto`` stands for."""
     return "fast" if on_accelerator else "cpu"
 
 
-def default_preset() -> str:
+def describe_default_preset() -> str:
     """Describe the default of ``--preset`` for the help."""
-    return f"default: auto, which is {_auto(guess_accelerator())} on this machine; its values are the defaults shown below"
+    return (
+        f"default: auto, which is {_auto_preset(guess_accelerator())} on this machine; its values are the defaults shown below"
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Train:
 
     env: Annotated[str | None, AlsoPositional()] = None
     """Environment: a name listed by `jaxrl-vis envs`, or module:Name for a custom one; VisualFetchReach if not given."""
-    preset: Annotated[str, DefaultText(default_preset)] = "auto"
+    preset: Annotated[str, DefaultText(describe_default_preset)] = "auto"
     """paper, fast, cpu or debug, some with task-specific values (docs/configuration.md); auto is fast on an accelerator, else
     cpu."""
     changes: Annotated[Mapping[str, Any], FieldsOf(Config, describe_default)] = dataclasses.field(default_factory=dict)
@@ -89,7 +91,7 @@ def training_config(options: Train) -> Config:
         from jaxrl_vis.run.signals import shielded_children
 
         with shielded_children():
-            changes["devices"] = count_devices(options.devices)
+            changes["devices"] = parse_device_count(options.devices)
     name = options.preset
     if name not in ("auto", *PRESETS):
         raise RequestError(f"unknown preset {name!r}{nearest(name, ['auto', *PRESETS])}")
@@ -104,7 +106,7 @@ def training_config(options: Train) -> Config:
             start_devices()
             importlib.import_module("jaxrl_vis.run.trainer")  # needed later, and takes as long
             check_devices()
-            name = _auto(jax.default_backend() != "cpu")
+            name = _auto_preset(jax.default_backend() != "cpu")
     return preset(name, **changes)
 
 
@@ -132,17 +134,17 @@ def config_lines(config: Config, set_options: Collection[str]) -> list[str]:
             source = f"preset {name}, for {environment.env}"
         elif value != OPTIONS[option].default and option != "preset":
             source = f"preset {name}"
-        shown = " ".join(map(str, _words(value))) or "none"
+        shown = " ".join(map(str, _as_tuple(value))) or "none"
         lines.append(f"{option:27} {shown:24} {source}".rstrip())
     return lines[1:]
 
 
-def _words(value: Any) -> tuple[Any, ...]:
+def _as_tuple(value: Any) -> tuple[Any, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
 def run(options: Train) -> int:
-    """Train; reports are shown and saved by the trainer."""
+    """Train, or with ``show_config`` print the configuration; the trainer prints and saves its reports."""
     check_counts(start_timeout=options.start_timeout)
     claim_memory()
     rank = distributed.find_rank(options.coordinator, options.num_processes, options.process_id)
@@ -153,7 +155,7 @@ def run(options: Train) -> int:
         raise RequestError("--resume and --overwrite contradict each other; give one of them")
     group.check(options.log)
     if options.run_dir is not None:
-        check_there(options.run_dir, options.resume)
+        check_resumable(options.run_dir, options.resume)
     if options.env is not None:
         check_env(options.env, options.changes.get("env_folder"))
     config = validate(training_config(options))
@@ -161,10 +163,10 @@ def run(options: Train) -> int:
         streams.echo("\n".join(config_lines(config, set(options.changes))))
         return 0
     run_dir = options.run_dir or default_folder(config)
-    check_there(run_dir, options.resume)
+    check_resumable(run_dir, options.resume)
     if options.resume and "env_folder" not in options.changes and (run_dir / "config.json").exists():
-        named = {options.env, *(word for value in options.changes.values() for word in _words(value))}
-        if set(own_names(config).values()) - named:
+        named = {options.env, *(word for value in options.changes.values() for word in _as_tuple(value))}
+        if set(custom_names(config).values()) - named:
             may_run_code(run_dir, options.trust)  # the custom part is named by the run, not by the user
     check_env(config.environment.env, config.environment.env_folder)
     from jaxrl_vis.run import trainer

@@ -21,7 +21,7 @@ from jaxrl_vis.config.groups import (
     config_from_dict,
     data_devices,
     marked,
-    of_weightings,
+    weighting_options,
 )
 from jaxrl_vis.config.presets import PRESETS, TASKS, general_values, preset
 from jaxrl_vis.config.validation import validate
@@ -41,7 +41,7 @@ __all__ = [
     "data_devices",
     "general_values",
     "marked",
-    "of_weightings",
+    "weighting_options",
     "preset",
     "validate",
 ]

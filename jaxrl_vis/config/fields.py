@@ -176,7 +176,7 @@ def unwrap(hint: Any) -> tuple[Any, bool, bool]:
     return hint, optional, several
 
 
-def is_name_or_parts(hint: Any) -> bool:
+def names_components(hint: Any) -> bool:
     """Return True if a field with this annotation names one or several components."""
     return _names(unwrap(hint)[0]) is not None
 
@@ -184,10 +184,10 @@ def is_name_or_parts(hint: Any) -> bool:
 def is_known(hint: Any) -> bool:
     """Return True if values with this annotation can be checked and parsed."""
     try:
-        one, _, _ = unwrap(hint)
+        base, _, _ = unwrap(hint)
     except (ValueError, IndexError):  # a union of several kinds, an empty tuple
         return False
-    return one in _KINDS or typing.get_origin(one) is Literal or _names(one) is not None
+    return base in _KINDS or typing.get_origin(base) is Literal or _names(base) is not None
 
 
 def choices(hint: Any) -> tuple[str, ...]:
@@ -209,31 +209,31 @@ def check(label: str, hint: Any, value: Any) -> Any:
     Raises:
         RequestError: The value does not match the annotation.
     """
-    one, optional, several = unwrap(hint)
+    base, optional, several = unwrap(hint)
     if value is None and optional:
         return None
     if several:
         if not isinstance(value, list | tuple):
             raise RequestError(f"{label} must be a list, not {_quote(value)}")
-        return tuple(check(label, one, item) for item in value)
-    if names := _names(one):
+        return tuple(check(label, base, item) for item in value)
+    if names := _names(base):
         if value not in names.known and not _is_own(value):
             raise RequestError(f"{label} cannot be {_quote(value)}{nearest(str(value)[:_MAX_LENGTH], names.known)}")
         return value
-    if typing.get_origin(one) is Literal:
-        if value not in typing.get_args(one):
-            raise RequestError(f"{label} cannot be {_quote(value)}{nearest(str(value)[:_MAX_LENGTH], typing.get_args(one))}")
+    if typing.get_origin(base) is Literal:
+        if value not in typing.get_args(base):
+            raise RequestError(f"{label} cannot be {_quote(value)}{nearest(str(value)[:_MAX_LENGTH], typing.get_args(base))}")
         return value
     if isinstance(value, bool):  # which is an int as well
-        if one is bool:
+        if base is bool:
             return value
-    elif one is int and isinstance(value, numbers.Integral):
+    elif base is int and isinstance(value, numbers.Integral):
         return int(value)
-    elif one is float and isinstance(value, numbers.Real) and _is_finite(value):
+    elif base is float and isinstance(value, numbers.Real) and _is_finite(value):
         return float(value)
-    elif one in (str, Path) and isinstance(value, one):
+    elif base in (str, Path) and isinstance(value, base):
         return value
-    _refuse(label, one, value)
+    _refuse(label, base, value)
 
 
 def read(label: str, hint: Any, words: Sequence[str]) -> Any:
@@ -247,21 +247,21 @@ def read(label: str, hint: Any, words: Sequence[str]) -> Any:
     Raises:
         RequestError: The arguments cannot be parsed.
     """
-    one, optional, several = unwrap(hint)
+    base, optional, several = unwrap(hint)
     if several:
-        return tuple(read(label, one, [word]) for word in words)
+        return tuple(read(label, base, [word]) for word in words)
     (word,) = words
     if optional and word.lower() == "none":
         return None
     try:
-        value = _TRUTH.get(word.lower(), word) if one is bool else one(word) if one in (int, float, Path) else word
-        if one is Path:
+        value = _TRUTH.get(word.lower(), word) if base is bool else base(word) if base in (int, float, Path) else word
+        if base is Path:
             value.exists()
     except ValueError:
-        _refuse(label, one, word)
+        _refuse(label, base, word)
     except OSError as error:  # a name that is too long, a folder without permission
         raise RequestError(f"{label} {word[:60]}{'...' if len(word) > 60 else ''}: {error.strerror or error}") from error
-    return check(label, one, value)
+    return check(label, base, value)
 
 
 def _is_finite(value: Any) -> bool:
@@ -271,8 +271,8 @@ def _is_finite(value: Any) -> bool:
         return False
 
 
-def _refuse(label: str, kind: Any, value: Any) -> NoReturn:
-    raise RequestError(f"{label} must be {_KINDS[kind]}, not {_quote(value)}{_suggestion(kind, value)}")
+def _refuse(label: str, base: Any, value: Any) -> NoReturn:
+    raise RequestError(f"{label} must be {_KINDS[base]}, not {_quote(value)}{_suggestion(base, value)}")
 
 
 def _quote(value: Any) -> str:
@@ -281,10 +281,10 @@ def _quote(value: Any) -> str:
     return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]}..."
 
 
-def _suggestion(kind: Any, value: Any) -> str:
+def _suggestion(base: Any, value: Any) -> str:
     """Return a hint with the integer spelling of a whole number written otherwise, such as 1e6; empty if not applicable."""
     try:
-        number = float(value) if kind is int and not isinstance(value, bool) else math.nan
+        number = float(value) if base is int and not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):
         return ""
     return f": write {int(number)}" if number.is_integer() and abs(number) < 2**53 else ""

@@ -291,7 +291,7 @@ class StudyOptions:
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """One training run. The defaults are those of the preset ``fast``; `preset` also applies its task-specific values."""
+    """Configuration of one training run. The defaults are the general values of the preset ``fast`` (`presets.preset`)."""
 
     run: RunOptions = RunOptions()
     environment: EnvironmentOptions = EnvironmentOptions()
@@ -336,15 +336,15 @@ def marked(mark: Mark) -> tuple[str, ...]:
     return tuple(name for name, field in OPTIONS.items() if mark in field.extras)
 
 
-def of_weightings() -> dict[str, tuple[str, ...]]:
+def weighting_options() -> dict[str, tuple[str, ...]]:
     """Map each field that is read only if losses are weighted to its weightings; an empty tuple stands for any weighting."""
     marks = {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, OfWeighting)}
     return {name: mark.names for name, mark in marks.items()}
 
 
-def read_by(kind: type[T]) -> dict[str, T]:
-    """Map each field annotated with an instance of ``kind``, `OfAlgorithm` or `OfMethod`, to that instance."""
-    return {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, kind)}
+def options_read_by(owner: type[T]) -> dict[str, T]:
+    """Map each field annotated with an instance of ``owner``, `OfAlgorithm` or `OfMethod`, to that instance."""
+    return {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, owner)}
 
 
 def check_names(changes: Mapping[str, Any]) -> Mapping[str, Any]:

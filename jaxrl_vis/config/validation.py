@@ -16,8 +16,8 @@ from jaxrl_vis.config.groups import (
     OfMethod,
     data_devices,
     marked,
-    of_weightings,
-    read_by,
+    options_read_by,
+    weighting_options,
 )
 from jaxrl_vis.config.methods import ALGORITHMS, METHODS
 from jaxrl_vis.errors import RequestError
@@ -47,11 +47,11 @@ def validate(config: Config) -> Config:
         raise RequestError(
             f"n_step {study.n_step} with method {config.reward.method}: the filter's valid range assumes one step"
         )
-    for name, algorithms in read_by(OfAlgorithm).items():
+    for name, algorithms in options_read_by(OfAlgorithm).items():
         if _is_changed(config, name) and run.algorithm in ALGORITHMS and run.algorithm not in algorithms.names:
-            wanted = " or ".join(algorithms.names)
-            raise RequestError(f"{name} is an option of --algorithm {wanted}, and this is {run.algorithm}: leave it out")
-    for name, reader in read_by(OfMethod).items():
+            readers = " or ".join(algorithms.names)
+            raise RequestError(f"{name} is an option of --algorithm {readers}, and this is {run.algorithm}: leave it out")
+    for name, reader in options_read_by(OfMethod).items():
         if _is_changed(config, name) and config.reward.method in METHODS and config.reward.method != reader.name:
             raise RequestError(
                 f"{name} is an option of --method {reader.name}, and this is {config.reward.method}: leave it out"
@@ -79,7 +79,7 @@ def _is_changed(config: Config, name: str) -> bool:
 def _validate_auxiliary(config: Config) -> None:
     """Raise a RequestError for an option of another weighting, or for one of auxiliary tasks if there are none."""
     weighting = config.auxiliary.weighting
-    for name, weightings in of_weightings().items():
+    for name, weightings in weighting_options().items():
         if weightings and _is_changed(config, name) and weighting not in weightings:
             raise RequestError(
                 f"{name} is an option of weighting {' and '.join(weightings)}, which {weighting} does not use: "
@@ -98,16 +98,16 @@ def _validate_devices(config: Config) -> None:
     groups = devices // along_data
     if seeds % groups:
         where = f"{groups} devices" if along_data == 1 else f"{groups} groups of {along_data} devices"
-        more = math.ceil(seeds / groups) * groups
+        rounded = math.ceil(seeds / groups) * groups
         raise RequestError(
-            f"seeds {seeds} cannot be divided among {where}: write --seeds {more}, or --data-devices {devices} to "
+            f"seeds {seeds} cannot be divided among {where}: write --seeds {rounded}, or --data-devices {devices} to "
             "divide each learner"
         )
     for name in marked(DIVIDED):
         value = config.value(name)
         if value % along_data:
-            option, more = f"--{name.replace('_', '-')}", math.ceil(value / along_data) * along_data
-            raise RequestError(f"{name} {value} cannot be divided among {along_data} devices: write {option} {more}")
+            option, rounded = f"--{name.replace('_', '-')}", math.ceil(value / along_data) * along_data
+            raise RequestError(f"{name} {value} cannot be divided among {along_data} devices: write {option} {rounded}")
 
 
 def _validate_reward(config: Config) -> None:

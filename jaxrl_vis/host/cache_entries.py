@@ -19,7 +19,7 @@ _ZSTANDARD = b"\x28\xb5\x2f\xfd"
 _hooked: Any = None
 
 
-def mend_damaged_entries() -> None:
+def repair_damaged_entries() -> None:
     """Install a hook that deletes damaged entries when JAX warns of them, and suppresses the warning; idempotent."""
     global _hooked
     if warnings.showwarning is _hooked:
@@ -40,14 +40,14 @@ def _delete_damaged(program: str) -> bool:
     folder = Path(str(jax.config.jax_compilation_cache_dir))
     entries = list(folder.glob(f"{program}-*{_SUFFIX}"))
     deleted = False
-    for entry in [entry for entry in entries if not _is_whole(entry)] or entries:
+    for entry in [entry for entry in entries if not _is_intact(entry)] or entries:
         with contextlib.suppress(OSError):
             entry.unlink()
             deleted = True
     return deleted
 
 
-def _is_whole(entry: Path) -> bool:
+def _is_intact(entry: Path) -> bool:
     """Return True if an entry can be decompressed, with the library that JAX used to write it."""
     try:
         contents = entry.read_bytes()

@@ -56,7 +56,7 @@ def check_devices() -> None:
     """Initialise JAX's devices and report errors of its configuration.
 
     Raises:
-        RequestError: JAX_PLATFORMS names a platform that is not available, or compilation is disabled.
+        RequestError: JAX finds no device, JAX_PLATFORMS names a platform that is not available, or compilation is disabled.
     """
     import jax
 
@@ -74,7 +74,7 @@ def check_devices() -> None:
             raise RequestError(f"JAX finds no device to compute on: {' '.join(str(error).split())}") from error
         available = _default_platform(requested)
         raise RequestError(
-            f"JAX_PLATFORMS={requested}, but JAX finds no such device here, only {available}{_mend(requested)}"
+            f"JAX_PLATFORMS={requested}, but JAX finds no such device here, only {available}{_hint(requested)}"
         ) from error
 
 
@@ -82,7 +82,8 @@ def enable_compilation_cache() -> str:
     """Enable JAX's persistent compilation cache, so that later starts take seconds.
 
     A folder that is already configured (JAX_COMPILATION_CACHE_DIR, or jax.config) is kept; otherwise it is ``jaxrl-vis/xla`` in
-    the user's cache folder, if that can be created. `cache_fault` reports problems with it.
+    the user's cache folder, if that can be created. `cache_fault` reports problems with it. Programs that take at least 0.3 s
+    to compile are cached, unless JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS is set.
 
     Returns:
         The folder; empty if there is none.
@@ -90,7 +91,7 @@ def enable_compilation_cache() -> str:
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
-    from jaxrl_vis.host.cache_entries import mend_damaged_entries
+    from jaxrl_vis.host.cache_entries import repair_damaged_entries
 
     default = default_cache()
     if not jax.config.jax_compilation_cache_dir and _write_fault(default) is None:
@@ -101,12 +102,12 @@ def enable_compilation_cache() -> str:
         compilation_cache.reset_cache()
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-    hush_cache()
-    mend_damaged_entries()
+    silence_cache_warnings()
+    repair_damaged_entries()
     return str(jax.config.jax_compilation_cache_dir or "")
 
 
-def hush_cache() -> None:
+def silence_cache_warnings() -> None:
     """Suppress JAX's warnings about an unusable cache, one per program; the run reports it once."""
     import jax
 
@@ -149,7 +150,7 @@ def _write_fault(folder: Path) -> str | None:
     return None
 
 
-def count_devices(requested: str) -> int:
+def parse_device_count(requested: str) -> int:
     """Parse a number of devices: a number, or ``all`` for the devices of all processes.
 
     Raises:
@@ -177,7 +178,7 @@ class Device:
 
 
 # Run in a separate process: once initialised, JAX holds some of a GPU's memory until the process ends.
-_ASK = """
+_LIST_DEVICES = """
 import json, sys
 from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.errors import RequestError
@@ -197,7 +198,7 @@ def list_devices() -> list[Device]:
         RequestError: JAX finds no device.
     """
     environment = child_environment() | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-    done = subprocess.run([sys.executable, "-c", _ASK], env=environment, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", _LIST_DEVICES], env=environment, capture_output=True, text=True)
     lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
     if done.returncode or not lines:
         raise RequestError(lines[-1] if lines else "JAX finds no device to compute on")
@@ -211,7 +212,7 @@ def list_devices() -> list[Device]:
 
 
 def shared(devices: Sequence[Device], processes: int) -> list[Device]:
-    """Repeat every device for a number of parallel processes, and divide GPU memory among them."""
+    """Return every device once per parallel process, with GPU memory divided among the processes of a device."""
     if processes == 1:
         return list(devices)
     share = {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{_MAX_MEMORY / processes:.3f}"}
@@ -235,7 +236,7 @@ def _exists(files: tuple[str, ...]) -> bool:
 
 
 def _default_platform(requested: str) -> str:
-    """Return the platform that JAX chooses without JAX_PLATFORMS, such as ``cpu``. The setting is restored."""
+    """Return the platform that JAX chooses without JAX_PLATFORMS, such as ``cpu``, or ``nothing``. The setting is restored."""
     import jax
     from jax.extend.backend import clear_backends
 
@@ -249,7 +250,7 @@ def _default_platform(requested: str) -> str:
         clear_backends()  # otherwise the next call would return the backend initialised here
 
 
-def _mend(requested: str) -> str:
+def _hint(requested: str) -> str:
     wanted = {word.strip().lower() for word in requested.split(",")}
     if "cpu" in wanted:
         return "; write JAX_PLATFORMS=cpu"

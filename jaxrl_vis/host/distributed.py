@@ -17,8 +17,8 @@ from jaxrl_vis.errors import RequestError
 START_S = 120
 """Time that a process waits for the others at startup, s."""
 _HEARTBEAT_S = 20  # a process without heartbeat for this long is considered dead, and the others are ended
-_SHUTDOWN_S = 30
-_LEAVE_S = 10
+_SHUTDOWN_TIMEOUT_S = 30
+_EXIT_TIMEOUT_S = 10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +54,7 @@ def find_rank(
     options = {"--coordinator": coordinator, "--num-processes": count, "--process-id": index}
     missing = [name for name, value in options.items() if value is None]
     if len(missing) == len(options):
-        return _by_launcher(variables)
+        return _find_launcher_rank(variables)
     if missing:
         raise RequestError(f"{', '.join(options)} belong together: {' and '.join(missing)} is missing")
     assert coordinator is not None and count is not None and index is not None
@@ -68,7 +68,7 @@ def find_rank(
     return Rank(coordinator, count, index) if count > 1 else None
 
 
-def _by_launcher(variables: Mapping[str, str]) -> Rank | None:
+def _find_launcher_rank(variables: Mapping[str, str]) -> Rank | None:
     launchers = (
         ("SLURM_STEP_NUM_TASKS", "SLURM_PROCID", "SLURM_STEP_NODELIST"),
         ("OMPI_COMM_WORLD_SIZE", "OMPI_COMM_WORLD_RANK", "OMPI_MCA_orte_hnp_uri"),
@@ -84,10 +84,10 @@ def start(rank: Rank, seconds: int = START_S) -> None:
 
     Args:
         rank: From `find_rank`.
-        seconds: Timeout.
+        seconds: Timeout, s.
 
     Raises:
-        RequestError: They were not found in time.
+        RequestError: The other processes were not found in time, or JAX cannot connect to them.
     """
     import jax
 
@@ -100,7 +100,7 @@ def start(rank: Rank, seconds: int = START_S) -> None:
             process_id=rank.index,
             initialization_timeout=seconds,
             heartbeat_timeout_seconds=_HEARTBEAT_S,
-            shutdown_timeout_seconds=_SHUTDOWN_S,
+            shutdown_timeout_seconds=_SHUTDOWN_TIMEOUT_S,
         )
     except (RuntimeError, ValueError, OSError) as error:
         reason = " ".join(str(error).split())[:200]
@@ -132,7 +132,7 @@ def _wait_for(coordinator: str, seconds: float) -> None:
     )
 
 
-def are_several() -> bool:
+def is_multi_process() -> bool:
     """Return True if there are several processes."""
     return _count_and_index()[0] > 1
 
@@ -151,31 +151,31 @@ def _count_and_index() -> tuple[int, int]:
     return (jax.process_count(), jax.process_index()) if jax.distributed.is_initialized() else (1, 0)
 
 
-def meet(name: str) -> None:
+def sync_processes(name: str) -> None:
     """Wait until all processes have reached this point.
 
     Args:
         name: Name of the synchronisation point.
     """
-    if are_several():
+    if is_multi_process():
         from jax.experimental import multihost_utils
 
         multihost_utils.sync_global_devices(name)
 
 
-def leave_together() -> None:
+def shut_down_together() -> None:
     """Shut down together with the other processes, within a timeout, so that each can print its error before JAX ends it.
 
     Call it after an error in the request, which all processes will raise.
     """
-    if not are_several():
+    if not is_multi_process():
         return
     import jax
 
     # In a thread, because JAX ends a process when its shutdown barrier fails.
     leaving = threading.Thread(target=jax.distributed.shutdown, daemon=True)
     leaving.start()
-    leaving.join(_LEAVE_S)
+    leaving.join(_EXIT_TIMEOUT_S)
 
 
 def any_process(answer: bool) -> bool:
@@ -185,7 +185,7 @@ def any_process(answer: bool) -> bool:
 
 def max_over_processes(number: int) -> int:
     """Return the maximum of ``number`` over all processes; a collective call."""
-    if not are_several():
+    if not is_multi_process():
         return number
     import numpy as np
     from jax.experimental import multihost_utils

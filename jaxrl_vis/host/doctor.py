@@ -11,7 +11,11 @@ from jaxrl_vis.host.devices import cache_fault, check_devices, enable_compilatio
 
 
 def versions() -> str:
-    """Return the versions of Python and of relevant packages."""
+    """Return the versions of Python and of relevant packages.
+
+    Raises:
+        ModuleNotFoundError: A package is missing.
+    """
     installed = provenance.versions()
     # The checkout itself does not have to be installed.
     missing = [name for name, version in installed.items() if version == provenance.NOT_INSTALLED and name != "jaxrl-vis"]
@@ -21,7 +25,11 @@ def versions() -> str:
 
 
 def devices() -> str:
-    """Return the platform and the device that JAX uses."""
+    """Return the platform and the device that JAX uses.
+
+    Raises:
+        RequestError: See `check_devices`.
+    """
     check_devices()
     return f"{provenance.device_record()['platform']}: {provenance.device_name()}"
 
@@ -56,6 +64,10 @@ def compilation_cache() -> str:
 def physics_and_camera() -> str:
     """Compile and run one control step, render it, and check that the image is neither empty nor equal to the goal
     image.
+
+    Raises:
+        FloatingPointError: The state is not finite.
+        ValueError: A check of the image fails.
     """
     import jax
     import jax.numpy as jnp
@@ -82,7 +94,11 @@ def physics_and_camera() -> str:
 
 
 def renderer() -> str:
-    """Render a ball above a floor, and check depths and segmentation against their known geometry."""
+    """Render a ball on a floor, and check depths and segmentation against the known geometry.
+
+    Raises:
+        ValueError: A depth or a label is wrong.
+    """
     import jax
     import mujoco
     import numpy as np
@@ -125,17 +141,17 @@ CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
 )
 
 
-def main(more: Sequence[tuple[str, Callable[[], str]]] = (), findings: dict[str, Any] | None = None) -> int:
+def main(further_checks: Sequence[tuple[str, Callable[[], str]]] = (), findings: dict[str, Any] | None = None) -> int:
     """Run all checks, even after failures, and print the results.
 
     Args:
-        more: Further checks, by name.
+        further_checks: Further checks, by name.
         findings: Filled with ``passed`` and ``text`` of each check, by name.
 
     Returns:
         0 if all checks pass; 1 if one fails; 2 if JAX is configured for a device that is not available, which stops the checks.
     """
-    failures, checks = 0, (*CHECKS, *more)
+    failures, checks = 0, (*CHECKS, *further_checks)
     for name, check in checks:
         try:
             verdict, text = "ok  ", check()

@@ -13,7 +13,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.documents import parse_json, read_text
 
 _TEMPORARY = re.compile(r"\.\d+-[0-9a-f]{16}\.tmp")
-_MOST_BYTES = 200_000_000  # maximum size of a JSON file: 100 times the records of the largest study
+_MAX_JSON_BYTES = 200_000_000  # maximum size of a JSON file: 100 times the records of the largest study
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
@@ -84,12 +84,12 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def read_json(path: Path, kind: type = dict, hint: str = "") -> Any:
+def read_json(path: Path, expected_type: type = dict, hint: str = "") -> Any:
     """Read a JSON file.
 
     Args:
         path: The file.
-        kind: Expected type of the value: dict, list, or object for any.
+        expected_type: Expected type of the value: dict, list, or object for any.
         hint: Hint on how to fix an unusable file, appended to the message.
 
     Raises:
@@ -98,7 +98,7 @@ def read_json(path: Path, kind: type = dict, hint: str = "") -> Any:
     hint = f": {hint}" if hint else ""
     check_path(path)
     try:
-        text = read_text(path, _MOST_BYTES)
+        text = read_text(path, _MAX_JSON_BYTES)
     except OSError as error:
         raise RequestError(f"cannot read {path} ({error.strerror or type(error).__name__}){hint}") from error
     except ValueError as error:
@@ -107,8 +107,8 @@ def read_json(path: Path, kind: type = dict, hint: str = "") -> Any:
         value = parse_json(text)
     except ValueError as error:
         raise RequestError(f"{path} is not JSON ({' '.join(str(error).split())}){hint}") from error
-    if not isinstance(value, kind):
-        wanted = "a table" if kind is dict else "a list"
+    if not isinstance(value, expected_type):
+        wanted = "a table" if expected_type is dict else "a list"
         raise RequestError(f"{path} must hold {wanted}, not {type(value).__name__}{hint}")
     return value
 
@@ -129,12 +129,12 @@ def check_path(path: Path) -> None:
     except (FileNotFoundError, NotADirectoryError):
         return
     except OSError as error:
-        raise RequestError(f"{_short(path)} cannot be used ({error.strerror or type(error).__name__})") from error
+        raise RequestError(f"{_shorten(path)} cannot be used ({error.strerror or type(error).__name__})") from error
     except ValueError as error:
-        raise RequestError(f"{_short(path)!r} cannot be used ({error})") from error
+        raise RequestError(f"{_shorten(path)!r} cannot be used ({error})") from error
 
 
-def _short(path: Path) -> str:
+def _shorten(path: Path) -> str:
     text = str(path)
     return text if len(text) <= 120 else f"{text[:80]}...{text[-30:]}"
 
@@ -150,8 +150,8 @@ def make_private(folder: Path) -> None:
         folder.chmod(0o700)
 
 
-def stranger_to(status: os.stat_result) -> str | None:
-    """Describe who else than this user and root may have written a file or folder; None if nobody, and on Windows.
+def foreign_writer(status: os.stat_result) -> str | None:
+    """Describe who other than this user and root may have written a file or folder; None if nobody, and on Windows.
 
     Args:
         status: Result of `os.stat`, or of `os.fstat` for an open file.
@@ -166,15 +166,18 @@ def stranger_to(status: os.stat_result) -> str | None:
 
 
 def read_private(path: Path) -> bytes | None:
-    """Read a file that only this user or root can have written; return None if it is missing or may be another user's.
+    """Read a file that only this user or root can have written.
 
     Symbolic links are not followed.
+
+    Returns:
+        The contents; None if the file cannot be read, or another user may have written it.
     """
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     try:
         with os.fdopen(os.open(path, flags), "rb") as file:
             status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode) or stranger_to(status) is not None:
+            if not stat.S_ISREG(status.st_mode) or foreign_writer(status) is not None:
                 return None
             return file.read()
     except (OSError, ValueError):

@@ -24,7 +24,7 @@ SCHEMA = 1
 _TASK = "VisualReacher"
 
 
-def driver() -> str | None:
+def driver_version() -> str | None:
     """Return the version of the NVIDIA driver; None if there is none."""
     command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
@@ -49,14 +49,14 @@ class Training:
     """Smoke test: a complete training run of the smallest preset with images.
 
     Attributes:
-        figures: Results of the last run: ``task``, ``preset``, ``env_steps``, ``env_steps_per_s`` (without compilation) and
-            ``wall_s``.
+        figures: Results of the last run: ``task``, ``env_steps``, ``env_steps_per_s`` (without compilation) and ``wall_s``;
+            None before it.
     """
 
     figures: dict[str, Any] | None = None
 
     def __call__(self) -> str:
-        """Train; the trainer checks that all numbers stay finite."""
+        """Train, and return a line for the report; the trainer raises an error if a number is not finite."""
         import jaxrl_vis
 
         start = time.perf_counter()
@@ -118,7 +118,7 @@ def to_record(findings: dict[str, Any], training: dict[str, Any] | None) -> dict
         "cores": os.cpu_count(),
         "accelerator": None if device["platform"] == "cpu" else f"{device['kind']} x{device['count']}",
         "backend": device["platform"],
-        "driver": driver(),
+        "driver": driver_version(),
         "versions": provenance.versions(),
         "revision": provenance.revision(12),
         "checks": {name: finding["passed"] for name, finding in findings.items()},

@@ -15,17 +15,17 @@ from jaxrl_vis_envs import task_modules
 T = TypeVar("T")
 
 
-def own_names(config: Config) -> dict[str, str]:
+def custom_names(config: Config) -> dict[str, str]:
     """Return the custom parts ``module:Name`` of a configuration, by their role: task, algorithm, aux_tasks 1, ..."""
     names = {"task": config.environment.env}
     for field, hint in fields.hints(Config).items():
-        if not fields.is_name_or_parts(hint):
+        if not fields.names_components(hint):
             continue
         value = config.value(field)
         names |= (
             {f"{field} {number}": name for number, name in enumerate(value, 1)} if isinstance(value, tuple) else {field: value}
         )
-    return {kind: name for kind, name in names.items() if task_modules.is_own(name)}
+    return {kind: name for kind, name in names.items() if task_modules.is_custom(name)}
 
 
 def find(kind: str, name: str, known: Mapping[str, T], folder: str | None = None) -> T | Any:
@@ -40,7 +40,7 @@ def find(kind: str, name: str, known: Mapping[str, T], folder: str | None = None
     Raises:
         RequestError: There is no such part, or its module cannot be imported.
     """
-    if not task_modules.is_own(name):
+    if not task_modules.is_custom(name):
         if name not in known:
             raise RequestError(f"unknown {kind} {name!r}{nearest(name, known)}")
         return known[name]
@@ -65,11 +65,11 @@ def load(name: str, folder: str | None = None) -> tuple[ModuleType, str]:
 
 
 def call(kind: str, name: str, maker: Any, *arguments: Any, of: type) -> Any:
-    """Call a custom function, and check the type of its result.
+    """Call the function of a custom part, and return its result after checking the type.
 
     Args:
         kind, name: As in `find`, for messages.
-        maker: The function, or the part itself.
+        maker: The function, or the part itself, which is returned as it is.
         arguments: Arguments of the function.
         of: Class of the part.
 
@@ -86,7 +86,7 @@ def call(kind: str, name: str, maker: Any, *arguments: Any, of: type) -> Any:
         raise
     except Exception as error:  # noqa: BLE001 - somebody else's code may raise anything
         file = getattr(getattr(maker, "__code__", None), "co_filename", None)
-        raise RequestError(f"{kind} {name} cannot be made: {task_modules.blame(error, file)}") from error
+        raise RequestError(f"{kind} {name} cannot be made: {task_modules.describe_error(error, file)}") from error
     if not isinstance(made, of):
         raise RequestError(f"{name} is no {kind}: it returned a {type(made).__name__}, not a {of.__name__}")
     return made

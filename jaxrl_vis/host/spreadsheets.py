@@ -15,6 +15,8 @@ _SIGNS = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
 def to_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
     """Format rows as CSV with a header; the columns default to those of the first row. None becomes an empty field.
 
+    Cells are escaped by `escape_cell`. Without columns, the result is empty.
+
     Raises:
         ValueError: A row has a column that is not in ``columns``.
     """
@@ -29,17 +31,17 @@ def to_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = No
 
 
 def escape_cell(value: Any) -> Any:
-    """Return the text of a cell, with an apostrophe if a spreadsheet would evaluate it; the inverse is `unescape_cell`."""
+    """Return the value of a cell, with an apostrophe before text that a spreadsheet would evaluate; see `unescape_cell`."""
     # Text that already has one gets another, so that `unescape_cell` is exact.
-    return f"'{value}" if isinstance(value, str) and _needs_mark(value) else value
+    return f"'{value}" if isinstance(value, str) and _needs_escape(value) else value
 
 
 def unescape_cell(written: str) -> str:
-    """Return the text from which `escape_cell` made ``written``."""
-    return written[1:] if written.startswith("'") and _needs_mark(written[1:]) else written
+    """Return the text that `escape_cell` converts to ``written``."""
+    return written[1:] if written.startswith("'") and _needs_escape(written[1:]) else written
 
 
-def _needs_mark(text: str) -> bool:
+def _needs_escape(text: str) -> bool:
     begin = text.lstrip("' ")
     return begin.startswith(_SIGNS) and not _is_number(text)
 

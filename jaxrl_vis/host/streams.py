@@ -15,19 +15,19 @@ class SafeStream:
     """Stream whose `write` and `flush` never raise; other attributes are those of the wrapped stream.
 
     Args:
-        below: The wrapped text stream; None discards everything.
+        stream: The wrapped text stream; None discards everything.
 
     Attributes:
         failure: The first error of the wrapped stream; None if there was none.
     """
 
-    def __init__(self, below: Any):
-        self._below = below
+    def __init__(self, stream: Any):
+        self._stream = stream
         self.failure: Exception | None = None
 
     def write(self, text: str) -> int:
         """Write as much as possible; return the length of ``text``."""
-        if self._below is not None:
+        if self._stream is not None:
             try:
                 self._write(text)
             except Exception as error:  # noqa: BLE001 - streams of notebooks and services raise errors of their own
@@ -36,9 +36,9 @@ class SafeStream:
 
     def _write(self, text: str) -> None:
         try:
-            self._below.write(text)
+            self._stream.write(text)
         except UnicodeEncodeError as error:
-            self._below.write(text.encode(error.encoding, "replace").decode(error.encoding))
+            self._stream.write(text.encode(error.encoding, "replace").decode(error.encoding))
 
     def writelines(self, lines: Iterable[str]) -> None:
         """Write a sequence of lines."""
@@ -47,22 +47,22 @@ class SafeStream:
 
     def flush(self) -> None:
         """Flush the wrapped stream, if possible."""
-        if self._below is not None:
+        if self._stream is not None:
             try:
-                self._below.flush()
+                self._stream.flush()
             except Exception as error:  # noqa: BLE001 - as above
                 self.failure = self.failure or error
 
     def isatty(self) -> bool:
         """Return True if the stream is a terminal."""
         with contextlib.suppress(Exception):
-            return bool(self._below.isatty())
+            return bool(self._stream.isatty())
         return False
 
     @property
     def encoding(self) -> str:
         """Encoding of the wrapped stream."""
-        return getattr(self._below, "encoding", None) or "utf-8"
+        return getattr(self._stream, "encoding", None) or "utf-8"
 
     def fileno(self) -> int:
         """Return the file descriptor of the wrapped stream.
@@ -70,16 +70,16 @@ class SafeStream:
         Raises:
             OSError: There is none.
         """
-        if self._below is None:
+        if self._stream is None:
             raise OSError("there is no stream")
-        return self._below.fileno()
+        return self._stream.fileno()
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._below, name)
+        return getattr(self._stream, name)
 
 
 def safe(stream: Any) -> SafeStream:
-    """Wrap a stream, such as ``sys.stdout``, which may be None or closed."""
+    """Wrap a stream, such as ``sys.stdout``, which may be None or closed; a `SafeStream` is returned unchanged."""
     return stream if isinstance(stream, SafeStream) else SafeStream(stream)
 
 

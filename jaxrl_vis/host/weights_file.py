@@ -23,10 +23,10 @@ _KINDS = {"F16": np.float16, "F32": np.float32}
 # An array quantised to 10 bits is stored as three: the upper 8 bits under its own name, and with these suffixes the lower 2
 # bits, four per byte, and the scales of the last axis. A wheel's compression would hardly shrink 10 bits in 16-bit words.
 _LOW, _SCALE = ".low", ".scale"
-_PLACES = np.array([0, 2, 4, 6], np.uint8)
+_BIT_SHIFTS = np.array([0, 2, 4, 6], np.uint8)
 _LEVELS = 511
-_FEWEST_QUANTISED = 4096  # minimum size of quantised arrays; smaller ones keep 16 bits, at negligible cost
-_LONGEST_HEADER = 1 << 20  # bytes; our networks have headers of some 15,000
+_MIN_QUANTISED_SIZE = 4096  # minimum size of quantised arrays; smaller ones keep 16 bits, at negligible cost
+_MAX_HEADER_BYTES = 1 << 20  # bytes; our networks have headers of some 15,000
 
 Settings = TypeVar("Settings")
 
@@ -46,32 +46,32 @@ def write_parameters(
         about: Description and origin, as a JSON value.
         bits: Bits per number. With 10, arrays with two or more axes and at least 4,096 numbers are quantised to integers from
             -511 to 511 with a scale per index of the last axis; the others use 16.
-        exact: Names of arrays that keep 32 bits.
+        exact: Names of arrays (paths such as ``detector/params/stem/kernel``) that keep 32 bits, unless they are quantised.
 
     Raises:
         OSError: The file cannot be written.
     """
     arrays: dict[str, np.ndarray] = {}
-    for name, leaf in _named(params).items():
+    for name, leaf in _flatten(params).items():
         array = np.asarray(leaf, np.float32)
-        if bits == 10 and array.ndim > 1 and array.size >= _FEWEST_QUANTISED:
-            arrays |= _quantised(name, array)
+        if bits == 10 and array.ndim > 1 and array.size >= _MIN_QUANTISED_SIZE:
+            arrays |= _quantise(name, array)
         else:
             arrays[name] = array.astype(np.float32 if bits == 32 or name in exact else np.float16)
     _write(path, arrays, about)
 
 
-def _quantised(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
-    """Quantize an array float32 [..., C] to 10 bits per number: three arrays by name."""
+def _quantise(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
+    """Quantise an array [..., C] float32 to 10 bits per number: three arrays by name."""
     scale = np.abs(array).max(axis=tuple(range(array.ndim - 1))) / np.float32(_LEVELS)
     levels = np.round(array / np.where(scale > 0, scale, 1)).astype(np.int16)
-    low = np.pad((levels & 3).ravel(), (0, -levels.size % 4)).reshape(-1, 4) << _PLACES
+    low = np.pad((levels & 3).ravel(), (0, -levels.size % 4)).reshape(-1, 4) << _BIT_SHIFTS
     return {name: (levels >> 2).astype(np.int8), f"{name}{_LOW}": low.sum(axis=1).astype(np.uint8), f"{name}{_SCALE}": scale}
 
 
-def _restored(high: np.ndarray, low: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Restore a quantized array to float32."""
-    lower = ((low[:, None] >> _PLACES) & 3).ravel()[: high.size].reshape(high.shape)
+def _restore(high: np.ndarray, low: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Restore a quantised array to float32 from its upper 8 bits, its packed lower 2 bits and its scales."""
+    lower = ((low[:, None] >> _BIT_SHIFTS) & 3).ravel()[: high.size].reshape(high.shape)
     return (4 * high.astype(np.float32) + lower.astype(np.float32)) * scale
 
 
@@ -81,7 +81,7 @@ def _write(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any
     write_atomically(path, save(whole, {_ABOUT: json.dumps(dict(about))}))
 
 
-def _named(params: Any) -> dict[str, Any]:
+def _flatten(params: Any) -> dict[str, Any]:
     """Return the leaves of nested dictionaries by path: ``detector/params/stem/kernel``."""
     return {"/".join(str(part.key) for part in names): leaf for names, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
 
@@ -99,10 +99,10 @@ def read_parameters(
             description is not that of a network.
 
     Returns:
-        Parameters, float32; settings; and the rest of the description.
+        Parameters, float32 on the default device; settings; and the rest of the description.
 
     Raises:
-        RequestError: The file is missing, or holds no parameters or those of another network.
+        RequestError: The file is missing, or holds no parameters, those of another network, or numbers that are not finite.
     """
     try:
         if path.suffix.lower() == ".npz" and path.is_file():
@@ -114,7 +114,7 @@ def read_parameters(
         with safetensors.safe_open(path, framework="numpy") as file:
             settings, shapes = declare(about)
             names = set(file.keys())
-            wanted = {name: tuple(leaf.shape) for name, leaf in _named(shapes).items()}
+            wanted = {name: tuple(leaf.shape) for name, leaf in _flatten(shapes).items()}
             quantised = {name for name in wanted.keys() & names if file.get_slice(name).get_dtype() == "I8"}
             kinds = dict.fromkeys(wanted, ("F16", "F32"))
             for name in quantised:
@@ -135,7 +135,7 @@ def read_parameters(
         raise RequestError(f"{path} holds no weights: name a file that `{command}` wrote") from error
     # With NumPy, because JAX would compile a program for each shape.
     for name in quantised:
-        arrays[name] = _restored(arrays[name], arrays.pop(f"{name}{_LOW}"), arrays.pop(f"{name}{_SCALE}"))
+        arrays[name] = _restore(arrays[name], arrays.pop(f"{name}{_LOW}"), arrays.pop(f"{name}{_SCALE}"))
     unsound = next((name for name, array in arrays.items() if not np.isfinite(array).all()), None)
     if unsound is not None:
         raise RequestError(f"{path} holds numbers that are not finite ({unsound}): train the weights again with `{command}`")
@@ -178,7 +178,7 @@ def _check_header(path: Path) -> None:
     if not path.is_file():
         raise ValueError("not a regular file")  # opening a pipe would block
     with path.open("rb") as file:
-        if not 2 <= int.from_bytes(file.read(8), "little") <= min(_LONGEST_HEADER, size - 8):
+        if not 2 <= int.from_bytes(file.read(8), "little") <= min(_MAX_HEADER_BYTES, size - 8):
             raise ValueError("no header")
 
 
@@ -193,7 +193,7 @@ def check_range(path: Path, name: str, values: tuple[float, ...], low: float, hi
         step: Divisor of each number, for whole numbers.
 
     Raises:
-        RequestError: The setting is out of range.
+        RequestError: A number is out of range, or there are none or more than 16.
     """
     unfit = next((value for value in values if not low <= value <= high or (step > 1 and value % step)), None)
     if unfit is not None or not 1 <= len(values) <= 16:
@@ -202,8 +202,8 @@ def check_range(path: Path, name: str, values: tuple[float, ...], low: float, hi
         raise RequestError(f"{path}: {name} of its network must be {kind}from {low:g} to {high:g}, 16 at most, not {shown}")
 
 
-def _other_network(path: Path, why: str, command: str) -> str:
-    return f"{path} holds weights of another network ({why}): train them again with `{command}`"
+def _other_network(path: Path, reason: str, command: str) -> str:
+    return f"{path} holds weights of another network ({reason}): train them again with `{command}`"
 
 
 def convert(old: Path, new: Path) -> None:

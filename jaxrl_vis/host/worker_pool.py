@@ -38,7 +38,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC
 
 
 def evaluate_all(
-    evaluate: Callable[[int], Record], numbers: Iterable[int], workers: int, done: Callable[[int, Record], None]
+    evaluate: Callable[[int], Record], numbers: Iterable[int], workers: int, on_record: Callable[[int, Record], None]
 ) -> None:
     """Evaluate numbers in this process or in several.
 
@@ -47,7 +47,7 @@ def evaluate_all(
             `functools.partial` of one.
         numbers: Numbers to evaluate.
         workers: Number of processes; 1 for this one. They share the machine's GPUs and cores.
-        done: Called in this process with a number and its record, in order of completion.
+        on_record: Called in this process with a number and its record, in order of completion.
 
     Raises:
         WorkerError: A process was killed from outside, most likely because memory ran out.
@@ -55,7 +55,7 @@ def evaluate_all(
     numbers = list(numbers)
     with worker_pool(min(workers, len(numbers))) as unordered_map:
         for number, record in unordered_map(functools.partial(_numbered, evaluate), numbers):
-            done(number, record)
+            on_record(number, record)
 
 
 def _numbered(evaluate: Callable[[int], Record], number: int) -> tuple[int, Record]:
@@ -200,7 +200,7 @@ class RecordFile:
     """
 
     def __init__(self, path: Path | None, about: Mapping[str, Any], summary: Callable[[list[Record]], Mapping[str, Any]]):
-        """Read the file, if it exists and was written under the same conditions.
+        """Read the file, if it exists; it must have been written under the same conditions.
 
         Args:
             path: The file; None to keep the records in memory only.
@@ -208,10 +208,10 @@ class RecordFile:
             summary: Computes the summary of records in the order of their numbers.
 
         Raises:
-            RequestError: The file has other conditions, or cannot be read.
+            RequestError: The file has other conditions, cannot be read, or holds a damaged record.
         """
         self.records: dict[int, Record] = {}
-        self._path, self._about, self._summary = path, json.loads(json.dumps(finite(about))), summary
+        self._path, self._about, self._summary = path, json.loads(json.dumps(replace_non_finite(about))), summary
         self._lines: dict[int, str] = {}
         if path is not None and path.exists():
             for record in _read(path, self._about):
@@ -232,11 +232,11 @@ class RecordFile:
         self.write()
 
     def write(self) -> None:
-        """Write the file."""
+        """Write the file atomically, unless the records are kept in memory only."""
         if self._path is None:
             return
         ordered = sorted(self.records)
-        figures = finite({**self._about, **self._summary([self.records[number] for number in ordered])})
+        figures = replace_non_finite({**self._about, **self._summary([self.records[number] for number in ordered])})
         head = json.dumps(figures, indent=2)
         lines = ",\n".join(f"    {self._lines[number]}" for number in ordered)
         write_atomically(self._path, f'{head[:-2]},\n  "each": [\n{lines}\n  ]\n}}\n')
@@ -251,18 +251,18 @@ class RecordFile:
             ) from error
 
     def _keep(self, number: int, record: Record) -> None:
-        record = finite(record)
+        record = replace_non_finite(record)
         # Results must not depend on whether a record was read from the file.
         line = json.dumps(record, allow_nan=False)
         self.records[number], self._lines[number] = json.loads(line), line
 
 
-def finite(value: Any) -> Any:
-    """Replace non-finite numbers by None, at any depth, for JSON."""
+def replace_non_finite(value: Any) -> Any:
+    """Return a copy with non-finite numbers replaced by None, at any depth, for JSON; tuples become lists."""
     if isinstance(value, Mapping):
-        return {name: finite(item) for name, item in value.items()}
+        return {name: replace_non_finite(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
+        return [replace_non_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -283,8 +283,8 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
     if other:
         name = other[0]
         raise RequestError(
-            f"{path} holds records of another evaluation ({name}: {_short(contents.get(name))}, not {_short(about[name])}): "
-            "name another file with --json"
+            f"{path} holds records of another evaluation "
+            f"({name}: {_shorten(contents.get(name))}, not {_shorten(about[name])}): name another file with --json"
         )
     numbers = [record["number"] for record in records]
     if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
@@ -292,6 +292,6 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
     return records
 
 
-def _short(value: Any) -> str:
+def _shorten(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) < 60 else f"{text[:57]}..."

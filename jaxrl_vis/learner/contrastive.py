@@ -29,7 +29,7 @@ from jaxrl_vis.learner.networks.policy import PolicyParams, make_policy
 from jaxrl_vis.types import Batch, Metrics, Params, Replaceable, Statistics
 
 LOGSUMEXP_PENALTY = 0.1
-"""Weight of the mean squared log-sum-exp of the logits, in form ``stable``."""
+"""Weight of the mean squared log-sum-exp of each row of logits, in form ``stable``."""
 
 
 @jax.tree_util.register_dataclass
@@ -64,7 +64,7 @@ def contrastive_loss(logits: jax.Array, form: str) -> jax.Array:
 
 
 def _check(setup: Setup) -> None:
-    """Check that the configuration has no rewards, auxiliary losses or goals of another kind, and one device per learner.
+    """Check that the algorithm supports a configuration.
 
     Raises:
         RequestError: It sets a reward or auxiliary losses, which this algorithm ignores, another sampling of goals than
@@ -91,7 +91,8 @@ def make(setup: Setup) -> Algorithm:
     """Build contrastive RL.
 
     Raises:
-        RequestError: The configuration sets rewards, auxiliary losses or goals that the algorithm does not support.
+        RequestError: The configuration sets rewards, auxiliary losses, goals or several devices per learner, which the
+            algorithm does not support.
     """
     form = setup.config.contrastive.contrastive_form
     return build(setup, functools.partial(contrastive_loss, form=form), stabilised=form == "stable")
@@ -133,21 +134,23 @@ def build(setup: Setup, loss: Callable[[jax.Array], jax.Array], stabilised: bool
         def encode(params: Params) -> jax.Array:
             return networks.encode_pieces(params, inputs.pieces("before", "goal")).reshape(2, inputs.size, -1)
 
-        def of_critic(critic: Params) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        def critic_objective(critic: Params) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
             latents = encode(critic)
             of_pairs, of_goals = represent(critic, latents, batch.action)
             logits = of_pairs @ of_goals.T
             return loss(logits), (logits, latents)
 
-        def of_actor(actor: Params, critic_latents: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def actor_objective(actor: Params, critic_latents: jax.Array) -> tuple[jax.Array, jax.Array]:
             latents = encode(actor) if "encoder" in actor else critic_latents
             action = networks.act(actor, _with_other_goals(latents))
             of_pairs, of_goals = represent(agent.critic, _with_other_goals(critic_latents), action)
             size = jnp.mean(jnp.square(action))
             return config.ddpg.action_penalty * size - jnp.mean(jnp.sum(of_pairs * of_goals, axis=-1)), size
 
-        (critic_loss, (logits, latents)), of_critic_parameters = jax.value_and_grad(of_critic, has_aux=True)(agent.critic)
-        (actor_loss, size), of_actor_parameters = jax.value_and_grad(of_actor, has_aux=True)(
+        (critic_loss, (logits, latents)), of_critic_parameters = jax.value_and_grad(critic_objective, has_aux=True)(
+            agent.critic
+        )
+        (actor_loss, size), of_actor_parameters = jax.value_and_grad(actor_objective, has_aux=True)(
             agent.actor, jax.lax.stop_gradient(latents)
         )
         critic, critic_optimizer = _step(
@@ -170,14 +173,14 @@ def _with_other_goals(latents: jax.Array) -> jax.Array:
 
 
 def _step(params: Params, gradient: Params, state: Any, learning_rate: float) -> tuple[Params, Any]:
-    """Take one step of Adam."""
+    """Take one step of Adam; return the new parameters and state."""
     count = adam.count(state) + 1
     params, state = adam.step(params, gradient, state, learning_rate, adam.corrections(count[None])[0])
     return params, adam.with_count(state, count)
 
 
 def _metrics(logits: jax.Array) -> Metrics:
-    """Compute the fraction of transitions whose own goal has the largest logit, and mean logits."""
+    """Compute the fraction of transitions whose own goal has the largest logit, and mean logits, [] float32 by name."""
     size, following = len(logits), jnp.diagonal(logits)
     return {
         "accuracy": jnp.mean((jnp.argmax(logits, axis=1) == jnp.arange(size)).astype(jnp.float32)),

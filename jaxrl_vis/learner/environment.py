@@ -11,11 +11,11 @@ from jaxrl_vis.host import plugins
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.randomization import typical
 from jaxrl_vis_envs.registry import config_class, load
-from jaxrl_vis_envs.task_modules import import_folder
+from jaxrl_vis_envs.task_modules import import_root
 
 
 def _option_of_environment(name: str) -> str | None:
-    """Return the option of the command line that sets a field of an environment; None if only ``env_options`` sets it."""
+    """Return the command-line option that sets a field of an environment; None if only ``env_options`` sets it."""
     if name == "randomization":
         return "--randomize"
     is_own = name in OPTIONS and OPTIONS[name].group == "environment"
@@ -23,31 +23,34 @@ def _option_of_environment(name: str) -> str | None:
 
 
 def locate_env(config: Config) -> Config:
-    """Return ``config`` with the folder of its ``module:Name`` parts filled in.
+    """Validate ``config``, and return it with ``env_folder`` set to the folder from which its ``module:Name`` are imported.
+
+    It is None if there are none, or if their modules are installed.
 
     Raises:
-        RequestError: The environment is unknown, its module cannot be imported, or the modules are in several folders.
+        RequestError: The configuration is invalid, the environment is unknown, a module cannot be imported, or the modules are
+            in several folders.
     """
     validate(config)
     try:
         folders = {config.environment.env: load(config.environment.env, config.environment.env_folder)}
     except ValueError as error:
         raise RequestError(str(error)) from error
-    for kind, name in plugins.own_names(config).items():
+    for kind, name in plugins.custom_names(config).items():
         if kind != "task":
-            folders[name] = import_folder(plugins.load(name, config.environment.env_folder)[0])
-    places = {folder: name for name, folder in folders.items() if folder is not None}
-    if len(places) > 1:
-        where = " and ".join(f"{name} in {folder}" for folder, name in places.items())
+            folders[name] = import_root(plugins.load(name, config.environment.env_folder)[0])
+    names = {folder: name for name, folder in folders.items() if folder is not None}
+    if len(names) > 1:
+        where = " and ".join(f"{name} in {folder}" for folder, name in names.items())
         raise RequestError(f"modules of a run must lie in one folder, or be installed; here are {where}")
-    return config.replace(env_folder=next(iter(places), None))
+    return config.replace(env_folder=next(iter(names), None))
 
 
 def make_env(config: Config) -> GoalEnv:
     """Build the environment of a configuration.
 
     Raises:
-        RequestError: The environment is unknown, or does not support the options.
+        RequestError: The configuration is invalid, or the environment is unknown or does not support the options.
     """
     locate_env(config)
     try:
@@ -71,7 +74,8 @@ def _read_options(environment: EnvironmentOptions) -> dict[str, Any]:
     """Convert ``env_options`` to the fields of the environment's configuration.
 
     Raises:
-        RequestError: An option is not of the form ``name=value``, or has an unknown name or an invalid value.
+        RequestError: An option is not of the form ``name=value``, has an unknown name or an invalid value, or is one that has a
+            command-line option of its own or cannot be written as text.
     """
     if not environment.env_options:
         return {}

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.learner.acting.rollout_parts import Played, join_parts
+from jaxrl_vis.learner.acting.rollout_parts import PartResult, join_parts
 from jaxrl_vis.learner.algorithm import Algorithm, Batches
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.memory.sampling import Sampler
@@ -36,11 +36,11 @@ _UPDATES = 0x757064
 
 
 class Learned(NamedTuple):
-    """Result of an iteration.
+    """Result of an iteration, for one learner or, after `jax.vmap`, for S learners.
 
     Attributes:
         loop: State at the start of the next iteration.
-        metrics: [S] float32 by name.
+        metrics: [] or [S] float32 by name.
     """
 
     loop: LoopState
@@ -60,7 +60,11 @@ def choose_batches(config: Config, sampler: Sampler, replay: ReplayState, key: j
 
 
 def _update_statistics(train: TrainState, episodes: Episodes, key: jax.Array, config: Config, sampler: Sampler) -> TrainState:
-    """Update the normaliser with the observations of a rollout."""
+    """Return the learner with normalisers updated from a rollout, or from as many transitions sampled from it.
+
+    The option ``normalizer_source`` selects one of these. Goals update their own normaliser if there is one, else the common
+    one.
+    """
     if config.study.normalizer_source == "rollouts":
         observations, goals = episodes.observations, episodes.observations[:, -1:]
         if train.goal_normalizer is not None:
@@ -112,7 +116,7 @@ def make_update(config: Config, sampler: Sampler, algorithm: Algorithm) -> Updat
 
 def make_learn(
     config: Config, insert: Insert, algorithm: Algorithm, sampler: Sampler, layout: Layout
-) -> Callable[[LoopState, Sequence[Played]], Learned]:
+) -> Callable[[LoopState, Sequence[PartResult]], Learned]:
     """Build the second half of an iteration.
 
     Returns:
@@ -121,7 +125,7 @@ def make_learn(
     """
     shards, num_envs = sampler.shards, sampler.replay.num_envs
 
-    def learn(loop: LoopState, parts: Sequence[Played]) -> Learned:
+    def learn(loop: LoopState, parts: Sequence[PartResult]) -> Learned:
         episodes, outcome = jax.tree.map(lambda *leaves: join_parts(leaves, num_envs), *parts)
         key = split_key(loop.key, loop.iteration)[1]
         train, replay_state = insert(loop.train, layout.unfold_replay(loop.replay), episodes, key, loop.iteration)

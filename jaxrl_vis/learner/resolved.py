@@ -45,7 +45,8 @@ def resolve(config: Config, horizon: int) -> Resolved:
     R-/(1-gamma), the minimum value of any state.
 
     Raises:
-        RequestError: The discount or the filter threshold is out of range, or the method is unknown.
+        RequestError: The method is unknown, the discount or the filter threshold is out of range, a threshold is set for a
+            method that does not filter, or R+ is not larger than R-.
     """
     method = find("method", config.reward.method, METHODS, config.environment.env_folder)
     method = call("method", config.reward.method, method, of=Method)

@@ -27,7 +27,7 @@ from jaxrl_vis.learner import contrastive, td3
 from jaxrl_vis.learner import iteration as iterations
 from jaxrl_vis.learner.acting.evaluate import Evaluation, make_evaluate
 from jaxrl_vis.learner.acting.rollout import Acting, Exploration, play
-from jaxrl_vis.learner.acting.rollout_parts import Played, RolloutPart, part_size, played_spec
+from jaxrl_vis.learner.acting.rollout_parts import PartResult, RolloutPart, part_result_spec, part_size
 from jaxrl_vis.learner.algorithm import Algorithm, Setup
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.ddpg import ddpg
@@ -62,11 +62,11 @@ class TrainStep:
         replay: Sizes of one device's part of a learner's replay.
         layout: Placement of seeds and shards; all programs take and return arrays with this placement.
         exploration: Exploration noise of training; evaluations have none.
-        plays_any: True if ``play`` can start at any environment, and thus also evaluate; otherwise it runs a whole rollout.
+        plays_parts: True if ``play`` can start at any environment, and thus also evaluate; otherwise it runs a whole rollout.
         part_size: P, number of environments that one call of ``play`` steps, on all devices together.
         init: keys [S] -> LoopState.
         keys: (keys [S], iteration []) -> keys [S] of this iteration's rollout.
-        play: (TrainState, keys [S], number [] int32 of the first environment, `Exploration`) -> `Played`.
+        play: (TrainState, keys [S], number [] int32 of the first environment, `Exploration`) -> `PartResult`.
         learn: (LoopState, donated; parts of the rollout in their order) -> `Learned`.
         evaluate: See `evaluate.make_evaluate`.
         pure_insert, pure_update: The components of ``learn``, for one learner, not jitted.
@@ -80,7 +80,7 @@ class TrainStep:
     replay: Replay
     layout: Layout
     exploration: Exploration
-    plays_any: bool
+    plays_parts: bool
     part_size: int
     init: Any
     keys: Any
@@ -117,7 +117,7 @@ class TrainStep:
 
     @property
     def replay_spec(self) -> ReplayState:
-        """Shapes of one seed's replay, or of one device's part of it, without allocating it."""
+        """Shapes and dtypes of one seed's replay, or of one device's part of it; nothing is allocated."""
         observation = self.env.observation_spec
         stored = self.auxiliary.stored_spec(observation, self.env.horizon)
         full_state_size = _full_state_size(self.env, self.config)
@@ -129,9 +129,9 @@ class TrainStep:
         return num_bytes(self.replay_spec) * self.layout.shards.count
 
     @property
-    def parts_spec(self) -> list[Played]:
-        """Shapes and placement of the parts of a rollout, as `learn` takes them."""
-        spec = played_spec(self.env, self.part_size, self.config.run.seeds, _full_state_size(self.env, self.config))
+    def parts_spec(self) -> list[PartResult]:
+        """Shapes, dtypes and placement of the parts of a rollout, as `learn` takes them."""
+        spec = part_result_spec(self.env, self.part_size, self.config.run.seeds, _full_state_size(self.env, self.config))
         spec = self.layout.with_shardings(spec, self.layout.by_environment)
         return [spec] * math.ceil(self.config.run.num_envs / self.part_size)
 
@@ -152,7 +152,7 @@ class TrainStep:
 
         return layout.spread(
             jax.vmap(insert, (0, 0, 0, 0, None)),
-            (seeds, replay, layout.by_environment, seeds, layout.everywhere),
+            (seeds, replay, layout.by_environment, seeds, layout.replicated),
             (seeds, replay),
             jaxrl_vis_envs.jit,
             donate_argnums=(0, 1),
@@ -175,7 +175,7 @@ class TrainStep:
 
         return layout.spread(
             jax.vmap(update_many, (0, 0, 0, None)),
-            (seeds, layout.replay, seeds, layout.everywhere),
+            (seeds, layout.replay, seeds, layout.replicated),
             (seeds, seeds),
             jaxrl_vis_envs.jit,
             donate_argnums=0,
@@ -257,8 +257,8 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
     sampler = Sampler(config, resolved, replay, env.threshold, as_goal, auxiliary, shards, mask)
     insert = iterations.make_insert(config, sampler, auxiliary)
     with tracing_for_default_device():
-        plays_any = targets_cpu() and layout.mesh is None and shards.count == 1
-    num_played = part_size(config.run.num_envs) if plays_any else config.run.num_envs // shards.count
+        plays_parts = targets_cpu() and layout.mesh is None and shards.count == 1
+    num_played = part_size(config.run.num_envs) if plays_parts else config.run.num_envs // shards.count
 
     def init_learner(key: jax.Array) -> TrainState:
         return TrainState(algorithm.init(key), *unseen)
@@ -276,13 +276,13 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
     def rollout_keys(keys: jax.Array, iteration: jax.Array) -> jax.Array:
         return jax.vmap(lambda key: iterations.split_key(key, iteration)[0])(keys)
 
-    def play_part(train: TrainState, keys: jax.Array, first: jax.Array, exploration: Exploration) -> Played:
-        draws = RolloutPart(first, config.run.num_envs) if plays_any else shards
+    def play_part(train: TrainState, keys: jax.Array, first: jax.Array, exploration: Exploration) -> PartResult:
+        draws = RolloutPart(first, config.run.num_envs) if plays_parts else shards
         episodes, outcome, _ = play(acting, train, keys, num_played, exploration, draws=draws)
         return episodes, outcome
 
     learn = iterations.make_learn(config, insert, algorithm, sampler, layout)
-    seeds, environments, replicated = layout.by_seed, layout.by_environment, layout.everywhere
+    seeds, environments, replicated = layout.by_seed, layout.by_environment, layout.replicated
     host = layout.read_by_host
 
     def spread(name: str, function: Any, in_specs: tuple, out_specs: Any, kept_as: Any = None) -> Any:
@@ -297,7 +297,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         replay=replay,
         layout=layout,
         exploration=Exploration(config.ddpg.random_action_probability, config.ddpg.action_noise),
-        plays_any=plays_any,
+        plays_parts=plays_parts,
         part_size=num_played * shards.count,
         init=spread("init", init, (seeds,), layout.loop),
         keys=spread("keys", rollout_keys, (seeds, replicated), seeds),

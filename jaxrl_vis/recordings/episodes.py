@@ -63,13 +63,13 @@ class Recordings:
                 f"actions must have the shape ({count}, {steps}, A) float32, not {actions.dtype} of {actions.shape}"
             )
         size = 0 if self.states is None else self.states.shape[-1]
-        wanted: dict[str, tuple[tuple[int, ...], Any]] = {
+        expected: dict[str, tuple[tuple[int, ...], Any]] = {
             "goals": ((count, *observations.shape[2:]), observations.dtype),
             "states": ((count, slots, size), np.float32),
             "goal_states": ((count, size), np.float32),
             "success": ((count,), np.bool_),
         }
-        for name, (shape, dtype) in wanted.items():
+        for name, (shape, dtype) in expected.items():
             array = getattr(self, name)
             if array is not None and (array.shape != shape or array.dtype != dtype):
                 raise RequestError(f"{name} must have the shape {shape} {np.dtype(dtype)}, not {array.dtype} of {array.shape}")

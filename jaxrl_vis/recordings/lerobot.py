@@ -21,7 +21,11 @@ _SECOND = 1.0  # default control period of episodes without one, s
 
 
 def check_packages(with_video: bool = True) -> None:
-    """Raise a `RequestError` unless the packages for writing and reading datasets are installed."""
+    """Raise a `RequestError` unless the packages for writing and reading datasets are installed.
+
+    Args:
+        with_video: Whether PyAV must be installed, too, and able to write H.264.
+    """
     try:
         import pandas  # noqa: F401
         import pyarrow.parquet  # noqa: F401
@@ -107,13 +111,13 @@ class _Writer:
         if not recordings.are_images:
             columns[form.STATE] = recordings.observations[:, :-1]
             if recordings.goals is not None:
-                columns[form.GOAL] = self._each_step(recordings.goals)
+                columns[form.GOAL] = self._repeat_per_step(recordings.goals)
         if recordings.states is not None and recordings.goal_states is not None:
             columns[form.TRUE_STATE] = recordings.states[:, :-1]
-            columns[form.TRUE_GOAL] = self._each_step(recordings.goal_states)
+            columns[form.TRUE_GOAL] = self._repeat_per_step(recordings.goal_states)
         return columns
 
-    def _each_step(self, goals: np.ndarray) -> np.ndarray:
+    def _repeat_per_step(self, goals: np.ndarray) -> np.ndarray:
         return np.broadcast_to(goals[:, None], (len(goals), self._recordings.horizon, goals.shape[-1]))
 
     def _write_data(self) -> None:
@@ -126,7 +130,7 @@ class _Writer:
                 encoded = [
                     {"bytes": data, "path": None}
                     for episode in range(self._recordings.count)
-                    for data in self._encode_video(name, episode)
+                    for data in self._encode_pngs(name, episode)
                 ]
                 columns[name] = pa.array(encoded, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
             elif feature["dtype"] != "video":
@@ -138,8 +142,8 @@ class _Writer:
                 )
         pq.write_table(pa.table(columns), self._path(form.DATA))
 
-    def _encode_video(self, name: str, episode: int) -> list[bytes]:
-        """Encode the images of an episode before each action; the goal's image is encoded only once."""
+    def _encode_pngs(self, name: str, episode: int) -> list[bytes]:
+        """Encode the images of an episode before each action as PNG; the goal's image is encoded only once."""
         shown = self._images(name, episode)[:-1]
         if name == form.GOAL_DEPTH:
             return [images.encode_png(shown[0])] * len(shown)

@@ -102,7 +102,15 @@ class _Reader:
         return np.concatenate([values, last[:, None]], axis=1)
 
     def _observations(self, is_ours: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return observations [N, T+1, ...], and goals [N, ...] if there are any."""
+        """Return observations [N, T+1, ...], and goals [N, ...] or None.
+
+        Args:
+            is_ours: Whether the dataset is one of `lerobot`, with goals and the observation after the last action. If not,
+                observations are those before each action, [N, T, ...].
+
+        Raises:
+            RequestError: Another program's dataset has several cameras.
+        """
         if is_ours and form.STATE not in self._features:
             names = [name for name in (form.CAMERA, form.DEPTH) if name in self._features]
             goals = [name for name in (form.GOAL_CAMERA, form.GOAL_DEPTH) if name in self._features]
@@ -126,7 +134,11 @@ class _Reader:
         return self._append_last(form.STATE, observations), goals_of_all
 
     def _images(self, name: str, count: int | None = None) -> np.ndarray:
-        """Return the first ``count`` images of every episode, or all T: [N, count, H, W, 3] uint8."""
+        """Return the first ``count`` images of every episode, or all T: [N, count, H, W, 3] uint8.
+
+        Raises:
+            RequestError: A video lacks frames of an episode.
+        """
         count = count or self._steps
         height, width = self._features[name]["shape"][:2]
         shown = np.empty((len(self._rows), count, height, width, 3), np.uint8)

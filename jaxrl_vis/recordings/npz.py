@@ -38,6 +38,8 @@ def write(recordings: Recordings, path: Path) -> None:
 def read(path: Path) -> Recordings:
     """Read a file of `write`, or one of another program with ``observations`` and ``actions``.
 
+    Floating-point arrays are converted to float32.
+
     Args:
         path: The file.
 

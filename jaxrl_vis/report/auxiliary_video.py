@@ -25,7 +25,8 @@ class Predictions:
 
     Attributes:
         reconstruction: [K, T, C or 1, H, W] uint8, of the observation before the action.
-        flow: [K, T, H, W] float32, magnitude of the optical flow, in pixels per step; in [0, 1] if masks are rescaled.
+        flow: [K, T, H, W] float32, magnitude of the optical flow, in pixels per step; stretched to [0, 1] with
+            ``aux_form="release"``.
         flow_predicted: The prediction of ``flow``; borders that do not fill a block of the encoder may be missing.
         rotated: [K, T, C, H, W] uint8, the rotated observation.
         angle: [K, T] float32, its rotation, degrees counter-clockwise.
@@ -43,12 +44,12 @@ class Predictions:
 def draw_frames(
     episodes: videos.EpisodeImages, predictions: Predictions, frame_seconds: float
 ) -> tuple[list[Image.Image], list[float]]:
-    """Draw all frames of the video; return them with their durations, s. Borders are as in `videos.draw_frames`.
+    """Draw all frames of the video; return them with their durations in seconds. Borders are as in `videos.draw_frames`.
 
     Args:
         episodes: T+1 images of each of K episodes, and their goals; success at the last step.
         predictions: Predictions for the first T images.
-        frame_seconds: Duration of a frame, s.
+        frame_seconds: Duration of a frame in seconds.
     """
     depth_range = videos.range_of_depth(episodes)
     max_flow = 1.0 if predictions.flow is None else max(1e-3, float(np.percentile(predictions.flow, 99.8)))

@@ -67,7 +67,7 @@ def print_table(names: Sequence[str] | None = None) -> None:
 
 
 def _make_all(names: Sequence[str] | None) -> tuple[dict[str, Any], dict[str, str]]:
-    """Create the environments ``names``; or all, with errors of those that cannot be created.
+    """Create the environments ``names``, or all; return them, and the errors of those that cannot be created, by name.
 
     Raises:
         RequestError: One of ``names`` cannot be created.
@@ -131,7 +131,7 @@ def render_poses(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
 
     scene = Scene.from_mjmodel(env.mj_model, env.camera, size, size)
     # A loop over single images compiles faster than a batch, and a few images render quickly.
-    draw = jaxrl_vis_envs.jit(lambda poses: jax.lax.map(lambda one: render(scene, one), poses))
+    draw = jaxrl_vis_envs.jit(lambda poses: jax.lax.map(lambda pose: render(scene, pose), poses))
     return jax.tree.map(np.asarray, draw(jaxrl_vis_envs.jit(sample)(keys)))
 
 
@@ -142,7 +142,8 @@ def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[st
         The environments to be drawn.
 
     Raises:
-        RequestError: The file cannot be written, its suffix is not an image format, or an environment has no images.
+        RequestError: The file cannot be written, its suffix is not an image format, or an environment has no images or cannot
+            be drawn.
     """
     try:  # Pillow registers suffixes of formats that it only reads, or that have no colours
         Image.new("RGB", (1, 1)).save(io.BytesIO(), Image.registered_extensions()[path.suffix.lower()])
@@ -160,7 +161,7 @@ def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[st
     return names
 
 
-def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, goals: int = 4) -> None:
+def write_gallery(path: Path, names: Sequence[str] | None = None, image_size: int = 128, goals: int = 4) -> None:
     """Write the gallery.
 
     Args:

@@ -32,7 +32,7 @@ def steps_to(points: Sequence[tuple[int, float]], target: float, lower_is_better
     Args:
         points: From `curve`.
         target: Value to be reached.
-        lower_is_better: Lower values are better.
+        lower_is_better: Whether a value reaches the target from above, as distances do.
     """
     for index in range(len(points) - CONFIRMATIONS):
         window = [value for _, value in points[index : index + 1 + CONFIRMATIONS]]

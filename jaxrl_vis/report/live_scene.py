@@ -15,7 +15,7 @@ _ENDLESS = 10.0  # half-size of infinite planes, m
 _ELEVATION, _TURN = np.radians(22.0), np.radians(35.0)  # initial view: above the horizon, and from the task's camera
 
 
-def surface(mj_model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray] | None:
+def geom_surface(mj_model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray] | None:
     """Return vertices [V, 3] float32 (m, frame of the geom) and triangles [F, 3] of a geom; None if it has no surface."""
     size = mj_model.geom_size[geom].astype(float)
     match mujoco.mjtGeom(mj_model.geom_type[geom]):
@@ -41,24 +41,24 @@ def surface(mj_model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray
     return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces)
 
 
-def colour(mj_model: mujoco.MjModel, geom: int) -> np.ndarray:
+def geom_colour(mj_model: mujoco.MjModel, geom: int) -> np.ndarray:
     """Return the colour of a geom, RGBA [4] in [0, 1]."""
     material = mj_model.geom_matid[geom]
     return mj_model.geom_rgba[geom] if material < 0 else mj_model.mat_rgba[material]
 
 
 def visible_geoms(mj_model: mujoco.MjModel, body: int) -> list[int]:
-    """List the visible geoms of a body."""
+    """List the ids of the visible geoms of a body: not of a collision group, and not fully transparent."""
     first, count = mj_model.body_geomadr[body], mj_model.body_geomnum[body]
     return [
         geom
         for geom in range(first, first + count)
-        if mj_model.geom_group[geom] < _VISIBLE_GROUPS and colour(mj_model, geom)[3] > 0
+        if mj_model.geom_group[geom] < _VISIBLE_GROUPS and geom_colour(mj_model, geom)[3] > 0
     ]
 
 
 def moving_bodies(mj_model: mujoco.MjModel) -> list[int]:
-    """List the movable bodies with visible geoms."""
+    """List the ids of the movable bodies, mocap bodies excluded, that have visible geoms."""
     moved = (mj_model.body_weldid != 0) & (mj_model.body_mocapid < 0)
     return [body for body in range(mj_model.nbody) if moved[body] and visible_geoms(mj_model, body)]
 
@@ -82,7 +82,7 @@ class LiveScene:
                 self._add_body(f"/still/{body}", body, xpos[body], xquat[body])
         self._robot = {body: self._add_body(f"/robot/{body}", body, xpos[body], xquat[body]) for body in self._moving}
         self._goal = {body: self._add_body(f"/goal/{body}", body, xpos[body], xquat[body], True) for body in self._moving}
-        self._look(server, xpos, camera)
+        self._set_view(server, xpos, camera)
 
     def show(self, xpos: np.ndarray, xquat: np.ndarray, is_goal: bool = False) -> None:
         """Move the robot, or its copy at the goal, to poses [B, 3] (m) and [B, 4]."""
@@ -95,10 +95,10 @@ class LiveScene:
             if self._model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
                 self._add_plane(f"{name}/{geom}", geom)
                 continue
-            mesh = surface(self._model, geom)
+            mesh = geom_surface(self._model, geom)
             if mesh is None:
                 continue
-            rgba = colour(self._model, geom)
+            rgba = geom_colour(self._model, geom)
             opacity = _GOAL_OPACITY if is_goal else float(rgba[3])
             self._scene.add_mesh_simple(
                 f"{name}/{geom}",
@@ -127,7 +127,7 @@ class LiveScene:
             wxyz=self._model.geom_quat[geom],
         )
 
-    def _look(self, server: Any, xpos: np.ndarray, camera: str) -> None:
+    def _set_view(self, server: Any, xpos: np.ndarray, camera: str) -> None:
         """Set the initial view beside that of the task's camera, such that the moving bodies fill it."""
         mj_data = mujoco.MjData(self._model)
         mujoco.mj_kinematics(self._model, mj_data)

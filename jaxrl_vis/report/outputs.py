@@ -16,17 +16,17 @@ def check_writable(path: Path, option: str = "", folder: bool = False) -> None:
 
     Args:
         path: The file or the folder.
-        option: The command line option, for the message.
-        folder: ``path`` is a folder.
+        option: The command-line option, for the message.
+        folder: Whether ``path`` is a folder.
 
     Raises:
         RequestError: The path cannot be written.
     """
-    wanted = f"{option} {path}".strip()
+    label = f"{option} {path}".strip()
     check_path(path)
     try:
         if path.exists() and path.is_dir() != folder:
-            raise RequestError(f"{wanted} is a {'file: name a folder' if folder else 'folder: name a file'}")
+            raise RequestError(f"{label} is a {'file: name a folder' if folder else 'folder: name a file'}")
         if path.is_file():
             with path.open("ab"):
                 return
@@ -34,11 +34,11 @@ def check_writable(path: Path, option: str = "", folder: bool = False) -> None:
             return  # a device or a pipe
         parent = next(candidate for candidate in (path, *path.absolute().parents) if candidate.exists())
         if not parent.is_dir():
-            raise RequestError(f"cannot write {wanted}: {parent} is a file, not a folder")
+            raise RequestError(f"cannot write {label}: {parent} is a file, not a folder")
         with tempfile.TemporaryFile(dir=parent):
             pass
     except OSError as error:
-        raise RequestError(f"cannot write {wanted}: {error.strerror or error}") from error
+        raise RequestError(f"cannot write {label}: {error.strerror or error}") from error
 
 
 def check_figure(out: Path) -> None:

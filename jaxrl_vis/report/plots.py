@@ -33,7 +33,7 @@ def gather(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[np.ndarray, np
     return np.asarray(steps, np.int64), values
 
 
-def show_steps(count: float, _: int | None = None) -> str:
+def format_steps(count: float, _: int | None = None) -> str:
     """Format a number of steps as ``250 k`` or ``1.44 M``."""
     if count >= 1e6:
         return f"{count / 1e6:g} M"
@@ -44,7 +44,7 @@ def draw_median(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, 
     """Draw the median over seeds as a thick line, and the middle half of the seeds as a band.
 
     Args:
-        axes: Where to draw.
+        axes: Axes to draw on.
         steps: [P] env_steps.
         values: [S, P], NaN for gaps.
         colour: The colour of both.
@@ -69,7 +69,7 @@ def draw_curves(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) 
     """Draw the median and its band, every seed as a thin line, and a dot at the end.
 
     Args:
-        axes: Where to draw.
+        axes: Axes to draw on.
         steps: [P] env_steps.
         values: [S, P], NaN for gaps.
         colour: The colour of all of these.
@@ -97,7 +97,7 @@ def style_curves(axes: Axes, title: str) -> None:
         axes.spines[side].set_visible(False)
     axes.spines["bottom"].set_color("#c9cdd3")
     axes.tick_params(colors=FAINT, labelcolor=INK, length=0, labelsize=9.5)
-    axes.xaxis.set_major_formatter(FuncFormatter(show_steps))
+    axes.xaxis.set_major_formatter(FuncFormatter(format_steps))
     axes.xaxis.set_major_locator(MaxNLocator(6))
     axes.yaxis.set_major_locator(MaxNLocator(6))
 

@@ -59,14 +59,17 @@ def first_seed(images: dict[str, Any]) -> EpisodeImages:
 
 
 def range_of_depth(episodes: EpisodeImages) -> tuple[float, float]:
-    """Return the robust depth range (percentiles) of all images, in grey levels."""
+    """Return a robust range of the last channel, depth, in grey levels: percentiles 0.5 and 99.5, at least 1 apart.
+
+    They are computed over the goals and every fifth frame of each episode.
+    """
     depth = np.concatenate([episodes.frames[:, ::5, -1].ravel(), episodes.goals[:, -1].ravel()])
     near, far = np.percentile(depth, [0.5, 99.5])
     return float(near), max(float(far), float(near) + 1.0)
 
 
 def image_rows(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[str, np.ndarray]]:
-    """Split an image [C, H, W] into captions and images [H, W, 3] uint8."""
+    """Split an image [C, H, W] into captions and images [H, W, 3] uint8; ``depth_range`` as from `range_of_depth`."""
     rows = []
     if image.shape[0] >= 3:
         rows.append(("colour", np.moveaxis(image[:3], 0, -1)))
@@ -171,7 +174,7 @@ def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
     return file.getvalue()
 
 
-def _strip(episodes: EpisodeImages) -> Image.Image:
+def _draw_strip(episodes: EpisodeImages) -> Image.Image:
     """Draw six steps of up to four episodes, one episode per row, with the goal at the right."""
     num_frames = episodes.frames.shape[1]
     depth_range = range_of_depth(episodes)
@@ -225,8 +228,8 @@ def write_video(episodes: EpisodeImages, path: Path, frame_seconds: float = 0.04
     Args:
         episodes: The episodes.
         path: The file; its suffix determines the format.
-        frame_seconds: Duration of a frame, s.
-        max_episodes: Number of episodes to show; a .png shows at most four.
+        frame_seconds: Duration of a frame in seconds; the last one of an episode is shown for `HOLD` seconds.
+        max_episodes: Maximum number of episodes to show; a .png shows up to four, regardless of it.
 
     Raises:
         RequestError: See `check_output`; or the observations are not images.
@@ -236,7 +239,7 @@ def write_video(episodes: EpisodeImages, path: Path, frame_seconds: float = 0.04
         raise RequestError(f"nothing to show: observations are vectors of {episodes.frames.shape[-1]} numbers, not images")
     if path.suffix.lower() == ".png":
         path.parent.mkdir(parents=True, exist_ok=True)
-        _strip(episodes).save(path)
+        _draw_strip(episodes).save(path)
         return
     write_images(*draw_frames(episodes, frame_seconds, max_episodes), path, frame_seconds)
 
@@ -246,9 +249,9 @@ def write_images(images: list[Image.Image], seconds: list[float], path: Path, fr
 
     Args:
         images: The frames.
-        seconds: Durations of the frames, s.
+        seconds: Durations of the frames in seconds.
         path: The file; its suffix determines the format; its folder is created.
-        frame_seconds: Duration of most frames, s.
+        frame_seconds: Duration of most frames in seconds, which determines the frame rate of an .mp4.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix.lower()

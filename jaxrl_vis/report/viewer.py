@@ -34,7 +34,7 @@ class PosedEpisodes(NamedTuple):
     """Poses of all bodies in E episodes and in their goals.
 
     Attributes:
-        positions, rotations: [E, T+1, B, 3] (m) and [E, T+1, B, 4], unit quaternions.
+        positions, rotations: [E, T+1, B, 3] (m) and [E, T+1, B, 4], unit quaternions, scalar first.
         goal_positions, goal_rotations: [E, B, 3] and [E, B, 4].
     """
 

@@ -1,1 +1,1 @@
-"""Host side of a run: trainer, loop, folder, checkpoints, metrics, memory, signals."""
+"""Host code of a run: trainer, loop, folder, checkpoints, metrics, memory, signals."""

@@ -22,7 +22,8 @@ def is_finished(
 ) -> bool:
     """Return True if a run is complete, with a valid last checkpoint, its evaluation, and its images.
 
-    The last checkpoint is that after ``total`` iterations, or after an early end.
+    The last checkpoint is that after ``total`` iterations, or after an early end. If it cannot be read, one line is passed to
+    ``echo``, and the run is not complete.
     """
     last = _last_saved(checkpoints)
     if last < total and not has_ended_early(folder, programs.config, programs.seeds, last):
@@ -53,7 +54,7 @@ def _last_saved(checkpoints: Checkpoints) -> int:
     return max([0, *checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)])
 
 
-def without_replay(programs: Programs, restored: Restored) -> LoopState:
+def state_without_replay(programs: Programs, restored: Restored) -> LoopState:
     """Build the state for resuming from a light checkpoint, which has no replay.
 
     Networks, optimisers, statistics and the iteration (and with it the random draws) are restored; the replay starts empty.
@@ -61,7 +62,7 @@ def without_replay(programs: Programs, restored: Restored) -> LoopState:
     interrupted one.
     """
     fresh, layout = programs.init(programs.run_keys), programs.layout
-    iteration = layout.put(jnp.asarray(restored.iteration, fresh.iteration.dtype), layout.everywhere)
+    iteration = layout.put(jnp.asarray(restored.iteration, fresh.iteration.dtype), layout.replicated)
     return fresh.replace(train=restored.train, iteration=iteration)
 
 
@@ -78,7 +79,7 @@ def last_evaluation(restored: Restored) -> int:
     return 0 if since is None else restored.iteration - len(since)
 
 
-def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
+def check_missing_rows(folder: RunFolder, restored: Restored) -> None:
     """Check that metrics.jsonl contains the evaluations before a checkpoint.
 
     Damaged lines and rows of another run count as possible evaluations, because a single flipped bit produces either. So do
@@ -99,19 +100,21 @@ def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
         )
 
 
-def cut_back(folder: RunFolder, checkpoints: Checkpoints, last: int, keeps_later: bool, evaluated: int = 0) -> str | None:
-    """Truncate metrics.jsonl to the run's rows up to an iteration, see `metrics.cut_back`."""
-    return metrics.cut_back(folder.metrics, last, checkpoints.run_id, *_asides(folder), keeps_later, evaluated)
+def truncate_metrics(
+    folder: RunFolder, checkpoints: Checkpoints, last: int, keeps_later: bool = False, evaluated: int = 0
+) -> str | None:
+    """Truncate metrics.jsonl to the run's rows up to iteration ``last``; further arguments and result as `metrics.truncate`."""
+    return metrics.truncate(folder.metrics, last, checkpoints.run_id, *_asides(folder), keeps_later, evaluated)
 
 
-def set_others_aside(folder: RunFolder, checkpoints: Checkpoints) -> list[str]:
+def set_foreign_files_aside(folder: RunFolder, checkpoints: Checkpoints) -> list[str]:
     """Move other runs' files aside before this folder's run is deleted; return lines that report it."""
     try:
         checkpoints.run_id = read_run_id(folder.path)
     except RequestError:  # without an id, no file can be attributed
         return []
     moved = checkpoints.set_foreign_aside()
-    report = cut_back(folder, checkpoints, sys.maxsize, keeps_later=False)
+    report = truncate_metrics(folder, checkpoints, sys.maxsize)
     return [*map(foreign_message, moved), *([report] if report else [])]
 
 

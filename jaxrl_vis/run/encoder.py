@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jaxrl_vis_envs
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.ddpg.learned_reward import Compared, make_autoencoder
+from jaxrl_vis.learner.ddpg.learned_reward import RewardInputs, make_autoencoder
 from jaxrl_vis.learner.networks import frozen_encoder, normalizer
 from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.resolved import resolve
@@ -19,7 +19,10 @@ from jaxrl_vis_envs.base import GoalEnv
 
 
 def _collect(env: GoalEnv, episodes: int) -> Callable[[jax.Array], jax.Array]:
-    """Return a function key -> images [N, C, H, W] uint8 of episodes of random actions: all observations, and the goals."""
+    """Build the function key -> images [N, C, H, W] uint8 of episodes of random actions: after every step, and of the goals.
+
+    N is ``episodes`` times T + 1.
+    """
 
     def episode(key: jax.Array) -> jax.Array:
         start_key, action_key = jax.random.split(key)
@@ -73,7 +76,7 @@ def train_encoder(env: GoalEnv, config: Config, episodes: int, updates: int, pat
         nothing = jnp.zeros((len(chosen), env.action_size))
         batch = Batch(jnp.stack([chosen] * 3), nothing, nothing, nothing)
         pieces = [(networks.prepare(scaling, chosen), slice(None))]
-        compared = Compared(pieces, pieces, networks.normalize(scaling, chosen), batch)
+        compared = RewardInputs(pieces, pieces, networks.normalize(scaling, chosen), batch)
         loss, gradient = jax.value_and_grad(lambda params: model.loss_and_reward(params, compared)[0])(state.params)
         return model.apply(state, gradient), loss
 

@@ -29,10 +29,10 @@ from jaxrl_vis.host import distributed
 from jaxrl_vis.host.streams import reserve_standard_files, safe_streams
 from jaxrl_vis.run import earlier, trust
 from jaxrl_vis.run.compiled.memory import check_compiled, check_memory, fit_together
-from jaxrl_vis.run.compiled.pending import Pending
+from jaxrl_vis.run.compiled.pending import PendingMetrics
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.goodput import Goodput
-from jaxrl_vis.run.loggers.console import RunConsole, show_seconds, show_shares
+from jaxrl_vis.run.loggers.console import RunConsole, format_fractions, format_seconds
 from jaxrl_vis.run.loggers.group import Loggers
 from jaxrl_vis.run.milestones import Milestones
 from jaxrl_vis.run.pace import Pace
@@ -42,7 +42,7 @@ from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.run.storage import metrics
 from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
 from jaxrl_vis.run.storage.folder import RunFolder, read_record, read_run_id
-from jaxrl_vis.run.storage.lock import FolderGoneError, Held, run_lock
+from jaxrl_vis.run.storage.lock import FolderGoneError, HeldLock, run_lock
 from jaxrl_vis.run.storage.metrics import PerSeed
 from jaxrl_vis.run.storage.progress import Progress
 from jaxrl_vis.run.storage.restoring import Restored
@@ -80,8 +80,8 @@ class RunLoop:
         self._console = RunConsole(quiet=not self._writes)
         self._echo = self._console.echo
         self._checkpoints = Checkpoints(folder.checkpoints, self._echo)
-        self._held: Held | None = None  # by the first process
-        self._saver = Saver(programs, folder, self._checkpoints, self._echo, self._check_ours)
+        self._lock: HeldLock | None = None  # by the first process
+        self._saver = Saver(programs, folder, self._checkpoints, self._echo, self._check_ownership)
         self._milestones = Milestones(self._config, self._checkpoints, self._saver, self._echo)
         self._log, self._loggers = log, Loggers(log if self._writes else (), folder.path, self._echo)
         self._results = Results(programs, folder, self._loggers, self._echo)
@@ -92,12 +92,12 @@ class RunLoop:
         self._recent_at: int | None = None  # iteration of the recent state from which this process resumed
         self._replay_lost = False  # True if this process resumed from a light checkpoint
         self._loop: LoopState | None = None
-        self._unread: list[tuple[int, Pending]] = []  # iterations whose metrics the device may still be working on
+        self._unread: list[tuple[int, PendingMetrics]] = []  # iterations whose metrics the device may still be working on
         self._recorded: dict[str, jax.Array] = {}
         self._started, self._compile_s = time.monotonic(), 0.0
         self._pace = Pace(self._program.steps_per_iteration * self._config.run.seeds)
         self._is_left_alone = False
-        self._evaluated_there: set[int] = set()  # seeds that have a row of the iteration from which the run resumes
+        self._evaluated_seeds: set[int] = set()  # seeds that have a row of the iteration from which the run resumes
         self._evaluates_ahead = False  # True if evaluations are dispatched before the iteration's metrics are read
         self._evaluated_at = 0  # last evaluation according to the restored checkpoint
         self._owed_evaluation = False  # True if the restored checkpoint lacks its evaluation
@@ -113,13 +113,13 @@ class RunLoop:
         shapes, layout = self._programs.shapes, self._programs.layout
         stacked = self._program.replay.frame_stack
         memory = check_memory(self._config, shapes, self._program.replay_bytes, steps, layout, stacked)
-        distributed.meet("checked")  # before the first process writes anything that the others would detect
+        distributed.sync_processes("checked")  # before the first process writes anything that the others would detect
         if is_resumed:
             self._checkpoints.run_id = read_run_id(self._folder.path)
-        with run_lock(self._folder.path, self._echo) if self._writes else contextlib.nullcontext() as self._held, self._console:
+        with run_lock(self._folder.path, self._echo) if self._writes else contextlib.nullcontext() as self._lock, self._console:
             if is_resumed and earlier.is_finished(self._folder, self._checkpoints, self._programs, self._total, self._echo):
-                if self._writes and (said := earlier.cut_back(self._folder, self._checkpoints, sys.maxsize, keeps_later=False)):
-                    self._echo(said)
+                if self._writes and (note := earlier.truncate_metrics(self._folder, self._checkpoints, sys.maxsize)):
+                    self._echo(note)
                 self._echo(earlier.finished_message(self._folder, self._checkpoints, self._config, self._total))
                 return
             interruption = Interruption()
@@ -136,7 +136,7 @@ class RunLoop:
                 self._console.stop()
                 raise
             except StorageError as error:
-                if gone := self._gone():
+                if gone := self._ownership_error():
                     raise gone from error
                 self._rescue()
                 raise self._saver.storage_error(error) from error
@@ -147,7 +147,7 @@ class RunLoop:
                     self._rescue()
                 raise
             except Exception as error:
-                if gone := self._gone():
+                if gone := self._ownership_error():
                     raise gone from error
                 self._rescue()
                 raise
@@ -157,19 +157,19 @@ class RunLoop:
                     with contextlib.suppress(StorageError):
                         self._checkpoints.close()
                     self._loggers.close(in_a_hurry=bool(interruption))
-                    if self.has_begun and self._held is not None and not self._held.is_in_place():
+                    if self.has_begun and self._lock is not None and not self._lock.is_in_place():
                         self._folder.remove_remains(self._checkpoints.run_id)
                 self._goodput.close()
 
-    def _check_ours(self) -> None:
+    def _check_ownership(self) -> None:
         """Raise a `FolderGoneError` if the run folder was moved, deleted or taken over; called before every write."""
-        if self._held is not None and self.has_begun:
-            self._folder.check_ours(self._checkpoints.run_id, self._held)
+        if self._lock is not None and self.has_begun:
+            self._folder.check_ownership(self._checkpoints.run_id, self._lock)
 
-    def _gone(self) -> FolderGoneError | None:
+    def _ownership_error(self) -> FolderGoneError | None:
         """Return why nothing can be saved any more; None if the run folder still belongs to this run."""
         try:
-            self._check_ours()
+            self._check_ownership()
         except FolderGoneError as gone:
             self._console.stop()
             return gone
@@ -179,7 +179,7 @@ class RunLoop:
         self._console.stop()
         if not self.has_begun:  # nothing was learned since the last checkpoint, and the folder may belong to another run
             return
-        if distributed.are_several():
+        if distributed.is_multi_process():
             self._is_left_alone = True  # the other processes may have ended, and saving would wait for them
             return
         with contextlib.suppress(Exception):
@@ -191,13 +191,13 @@ class RunLoop:
     # -- Before
 
     def _prepare(self, is_resumed: bool, memory: str) -> dict[str, Any]:
-        """Restore and compile; return the compiled programs by name. Nothing is written."""
+        """Restore, if the run resumes, and compile; return the compiled programs by name. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
         self._echo(f"{self._config.environment.env}, {describe(self._config)}, on {programs.layout.name}; {memory}")
         self._echo(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
         restored = self._checkpoints.restore_for_resume(programs.shapes) if is_resumed else None
         if restored is not None:
-            earlier.refuse_missing_rows(self._folder, restored)
+            earlier.check_missing_rows(self._folder, restored)
             self._take_over(restored)
         elif is_resumed:
             self._echo("no usable checkpoint: starting at the beginning")
@@ -211,7 +211,7 @@ class RunLoop:
 
     def _begin(self, compiled: dict[str, Any], is_resumed: bool, overwrite: bool) -> None:
         """Check the memory again, the last check that can refuse the run; then prepare folder and state."""
-        self._echo(f"compiled in {show_seconds(self._compile_s)}")
+        self._echo(f"compiled in {format_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
         check_compiled(compiled, is_there, layout)
         has_room = not distributed.any_process(not fit_together(compiled, is_there, layout))  # and all have come here
@@ -220,7 +220,7 @@ class RunLoop:
             self._open(is_resumed, overwrite)
             if trust.is_own(self._config):  # and here it runs
                 trust.trust(self._folder.path, self._config, was_trained_here=True)
-        distributed.meet("opened")
+        distributed.sync_processes("opened")
         self._checkpoints.run_id = read_run_id(self._folder.path)
         self.has_begun = True
         self._on_begun()
@@ -232,7 +232,7 @@ class RunLoop:
                 self._checkpoints.recent.resume_from(self._recent_at)
                 self._goodput.begin(self._done, self._replay_lost)
                 self._begin_log(is_resumed, damaged, foreign)
-        distributed.meet("begun")
+        distributed.sync_processes("begun")
         if self._loop is None:
             self._loop = self._programs.init(self._programs.run_keys)
         self._console.start(self._total, self._done)
@@ -240,16 +240,16 @@ class RunLoop:
 
     def _open(self, is_resumed: bool, overwrite: bool) -> None:
         """Prepare the folder, unless it was moved or deleted during compilation."""
-        assert self._held is not None
-        self._folder.check_place(self._held)
+        assert self._lock is not None
+        self._folder.check_place(self._lock)
         try:
             if overwrite and self._folder.config.exists():
                 with self._saver.writing():
-                    for line in earlier.set_others_aside(self._folder, self._checkpoints):
+                    for line in earlier.set_foreign_files_aside(self._folder, self._checkpoints):
                         self._echo(line)
             self._folder.open(self._config, is_resumed, overwrite, self._log)
         except RequestError:
-            self._folder.check_place(self._held)
+            self._folder.check_place(self._lock)
             raise
 
     def _begin_log(self, is_resumed: bool, damaged: list[Path], foreign: list[Path]) -> None:
@@ -261,9 +261,9 @@ class RunLoop:
             foreign: Checkpoints of other runs that were set aside.
         """
         if is_resumed:
-            if said := earlier.cut_back(self._folder, self._checkpoints, self._done, bool(damaged), self._evaluated_at):
-                self._echo(said)
-            self._evaluated_there = {row["seed"] for row in self._folder.rows() if row["iteration"] == self._done}
+            if note := earlier.truncate_metrics(self._folder, self._checkpoints, self._done, bool(damaged), self._evaluated_at):
+                self._echo(note)
+            self._evaluated_seeds = {row["seed"] for row in self._folder.rows() if row["iteration"] == self._done}
         for path in damaged:
             self._echo(f"kept for inspection: {path}")
         for path in foreign:
@@ -285,7 +285,7 @@ class RunLoop:
             self._recent_at = restored.iteration if restored.tier == RECENT else None
             self._echo(f"resumed at iteration {self._done} of {self._total}, exactly")
             return
-        self._loop = earlier.without_replay(self._programs, restored)
+        self._loop = earlier.state_without_replay(self._programs, restored)
         if self._done < self._total:
             self._progress.replay_lost_at, self._replay_lost = self._done, True
         self._echo(
@@ -312,7 +312,7 @@ class RunLoop:
             evaluation = self._is_due(config.run.eval_interval) or self._done == self._total
             light, full = self._is_due(config.run.checkpoint_interval), self._is_due(config.run.full_checkpoint_interval)
             recent = self._saver.is_recent_due(light)
-            if not (evaluation or light or full or recent or (interruption and not distributed.are_several())):
+            if not (evaluation or light or full or recent or (interruption and not distributed.is_multi_process())):
                 continue
             # Before the metrics are read, so that the device does not wait for the host.
             outcome = self._begin_evaluation() if evaluation and self._evaluates_ahead else None
@@ -321,15 +321,15 @@ class RunLoop:
                 self._save_and_end(evaluation, interruption)
             if recent:  # and again after an evaluation, during which the process may be killed
                 self._progress.evaluation_due = evaluation
-                self._saver.recent(self._loop, self._done, self._progress_now())
+                self._saver.save_recent(self._loop, self._done, self._progress_now())
             if evaluation:
                 report = self._evaluate(report, self._begin_evaluation() if outcome is None else outcome)
             if recent and evaluation:
-                self._saver.recent(self._loop, self._done, self._progress_now())
+                self._saver.save_recent(self._loop, self._done, self._progress_now())
             if light:
-                self._saver.light(self._loop, self._done, self._progress_now())
+                self._saver.save_light(self._loop, self._done, self._progress_now())
             if full:
-                self._saver.full(self._loop, self._done, self._progress_now())
+                self._saver.save_full(self._loop, self._done, self._progress_now())
             # A signal received during the evaluation must not wait for another iteration.
             if self._done < self._total and interruption.reached_any():
                 self._save_and_end(False, interruption)
@@ -367,14 +367,14 @@ class RunLoop:
         self._console.advance(iteration, self._pace.speed(iteration))
         return self._report(iteration, values)
 
-    def _begin_evaluation(self) -> Pending:
+    def _begin_evaluation(self) -> PendingMetrics:
         """Dispatch an evaluation of the learner; `_evaluate` waits for the outcome."""
         assert self._loop is not None
         self._progress.evaluation_due = True  # until its rows are on the disk, whatever happens in between
         outcome, self._recorded = self._programs.evaluate(self._loop.train)
         return self._programs.pending(outcome)
 
-    def _evaluate(self, report: Report, outcome: Pending) -> Report:
+    def _evaluate(self, report: Report, outcome: PendingMetrics) -> Report:
         """Read the results of an evaluation, write a line per seed, and add the figures to the report."""
         progress, speed = self._progress, self._pace.speed(self._done)
         values = outcome.read_per_seed(self._config.run.seeds)
@@ -392,11 +392,11 @@ class RunLoop:
         if progress.replay_lost_at is not None:
             counts["resume/replay_lost_at"] = progress.replay_lost_at
         if self._writes:
-            self._check_ours()
+            self._check_ownership()
             rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded)
             rows = [{**row, metrics.RUN_ID: self._checkpoints.run_id} for row in rows]
             if self._done == self._pace.begun:  # an evaluation that was due: a kill or a disk may have left a part of its rows
-                rows = [row for row in rows if row["seed"] not in self._evaluated_there]
+                rows = [row for row in rows if row["seed"] not in self._evaluated_seeds]
             with self._saver.writing():
                 metrics.append_rows(self._folder.metrics, rows)
             self._loggers.rows(rows)
@@ -407,20 +407,20 @@ class RunLoop:
             progress.since_evaluation = []
         self._show(values, speed)
         assert self._loop is not None
-        self._milestones.evaluated(self._loop, self._done, values, self._progress_now())
+        self._milestones.save_if_best(self._loop, self._done, values, self._progress_now())
         self._pace.mark(self._done)
         return dataclasses.replace(report, metrics=report.metrics | values)
 
     def _show(self, values: PerSeed, speed: float) -> None:
         success, distance, unit = values["eval/success"], values["eval/goal_distance"], self._programs.env.distance_unit
-        self._console.evaluated(success, distance, unit)
+        self._console.show_evaluation(success, distance, unit)
         env_steps = self._done * self._program.steps_per_iteration
-        words = [f"iteration {self._done}/{self._total}", f"{env_steps:,} steps", f"success {show_shares(success)}"]
+        words = [f"iteration {self._done}/{self._total}", f"{env_steps:,} steps", f"success {format_fractions(success)}"]
         words.append(f"distance {np.median(distance):.3f} {unit}")
         if self._done > self._pace.begun:  # the speed is unknown if only a missed evaluation was made up for
             words.append(f"{speed:,.0f} steps/s")
             if self._done < self._total:
-                words.append(f"about {show_seconds(self._pace.seconds_left(self._done, self._total))} left")
+                words.append(f"about {format_seconds(self._pace.seconds_left(self._done, self._total))} left")
         self._echo("  ".join(words))
 
     def _warn_if_filtered(self, values: PerSeed) -> None:
@@ -443,10 +443,10 @@ class RunLoop:
         assert self._loop is not None
         self._console.stop()
         self._progress.evaluation_due = evaluation_due
-        self._saver.on_signal(self._loop, self._done, self._progress_now(), interruption)
+        self._saver.save_on_signal(self._loop, self._done, self._progress_now(), interruption)
         with contextlib.suppress(OSError, FolderGoneError):
             if self._writes:
-                self._check_ours()
+                self._check_ownership()
                 self._results.draw_curve(self._done)
         interruption.end()
 
@@ -461,9 +461,9 @@ class RunLoop:
     def _finish(self, interruption: Interruption) -> None:
         assert self._loop is not None
         if self._owed_evaluation or not self._saver.has(LIGHT, self._done):
-            self._saver.light(self._loop, self._done, self._progress_now())
+            self._saver.save_light(self._loop, self._done, self._progress_now())
         if self._config.run.full_checkpoint_interval and (self._owed_evaluation or not self._saver.has(FULL, self._done)):
-            self._saver.full(self._loop, self._done, self._progress_now())
+            self._saver.save_full(self._loop, self._done, self._progress_now())
         self._saver.finish()
         self._console.stop()
         if interruption.reached_any():
@@ -474,6 +474,6 @@ class RunLoop:
             _, self._recorded = self._programs.evaluate(self._loop.train)
         if self._writes:
             self._echo(self._goodput.account(self._done).describe(self._program.updates_per_iteration))
-            self._check_ours()
+            self._check_ownership()
             with self._saver.writing():
                 self._results.show(self._done, self._progress_now, self._recorded)

@@ -44,11 +44,11 @@ class Milestones:
                 self._echo(f"{error}: the next evaluation is the best")
                 continue
             score = progress.get(SCORE)
-            if progress.get(SCORED) == scores.metric(self._config) and isinstance(score, float):
+            if progress.get(SCORED) == scores.metric_name(self._config) and isinstance(score, float):
                 self._best = score
                 return
 
-    def evaluated(self, loop: LoopState, iteration: int, values: PerSeed, progress: Progress) -> None:
+    def save_if_best(self, loop: LoopState, iteration: int, values: PerSeed, progress: Progress) -> None:
         """Save the learner if its evaluation is the best.
 
         Args:
@@ -61,16 +61,16 @@ class Milestones:
             return
         score = scores.score(self._config, values)
         if scores.is_better(self._config, score, self._best):
-            about = {SCORE: score, SCORED: scores.metric(self._config)}
-            self._saver.best(loop, iteration, progress, about)
+            about = {SCORE: score, SCORED: scores.metric_name(self._config)}
+            self._saver.save_best(loop, iteration, progress, about)
             self._best = score
 
     def end_reason(self, report: Report, callbacks: Sequence[Callback]) -> str | None:
-        """Return the reason to end the run after this evaluation; None to continue."""
+        """Call all ``callbacks`` with the report; return the reason to end the run after this evaluation, None to continue."""
         asked = False
         for callback in callbacks:  # each of them, also after one that asks to stop
             asked |= callback(report) is True
         score = scores.score(self._config, report.metrics)
         if distributed.any_process(scores.is_enough(self._config, score)):
-            return f"{scores.metric(self._config)} {score:.3f} has reached --stop-at {self._config.run.stop_at:g}"
+            return f"{scores.metric_name(self._config)} {score:.3f} has reached --stop-at {self._config.run.stop_at:g}"
         return "a callback asked to stop" if distributed.any_process(asked) else None

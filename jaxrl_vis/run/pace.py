@@ -31,7 +31,7 @@ class Pace:
         return max(0, done - self._marked) * self._steps / max(1e-9, time.monotonic() - self._marked_at)
 
     def seconds_left(self, done: int, total: int) -> float:
-        """Return the estimated time until ``total`` iterations are done, s, at the average speed.
+        """Return the estimated time in seconds until ``total`` iterations are done, at the average speed of this process.
 
         Args:
             done: Iterations completed so far; must exceed `begun`.

@@ -38,7 +38,7 @@ def import_saving_libraries() -> None:
 
 
 class Saver:
-    """Saves the state of one run.
+    """Writer of a run's checkpoints, recent states and dumps of non-finite states.
 
     Args:
         programs: Programs of the run.
@@ -64,7 +64,7 @@ class Saver:
         """Return True if a tier has a checkpoint of an iteration; all processes return the same answer."""
         return distributed.any_process(iteration in self._checkpoints.iterations(tier))
 
-    def light(self, loop: LoopState, iteration: int, progress: Progress) -> None:
+    def save_light(self, loop: LoopState, iteration: int, progress: Progress) -> None:
         """Save the learner in the background.
 
         Raises:
@@ -77,8 +77,8 @@ class Saver:
         if not self._keeps_full:
             self._checkpoints.retire_full()
 
-    def best(self, loop: LoopState, iteration: int, progress: Progress, about: Mapping[str, Any]) -> None:
-        """Save the learner as the best one, and wait for the disk. Raises as `light`.
+    def save_best(self, loop: LoopState, iteration: int, progress: Progress, about: Mapping[str, Any]) -> None:
+        """Save the learner as the best one, and wait for the disk. Raises as `save_light`.
 
         Args:
             loop: The state.
@@ -90,8 +90,8 @@ class Saver:
         self._refuse_nonfinite(loop, iteration)
         self._checkpoints.save_best(iteration, loop.train, {**dataclasses.asdict(progress), **about})
 
-    def full(self, loop: LoopState, iteration: int, progress: Progress) -> None:
-        """Save the complete state and wait for the disk. Raises as `light`."""
+    def save_full(self, loop: LoopState, iteration: int, progress: Progress) -> None:
+        """Save the complete state and wait for the disk. Raises as `save_light`."""
         self._check()
         self._refuse_nonfinite(loop, iteration)
         self._checkpoints.save_full(iteration, loop, dataclasses.asdict(progress))
@@ -101,7 +101,7 @@ class Saver:
         return self._programs.layout.mesh is None and is_cheap(self._programs.shapes.replay)
 
     def is_recent_due(self, light: bool) -> bool:
-        """Return True if `recent` should be called after this iteration: it is cheap, and enough time has passed.
+        """Return True if `save_recent` should be called after this iteration: it is cheap, and enough time has passed.
 
         Args:
             light: True if a light checkpoint is about to be written, which must not become the newest one, because the run
@@ -109,11 +109,11 @@ class Saver:
         """
         return self._keeps_recent and self._checkpoints.recent.is_due(light)
 
-    def recent(self, loop: LoopState, iteration: int, progress: Progress) -> None:
+    def save_recent(self, loop: LoopState, iteration: int, progress: Progress) -> None:
         """Save the state for resuming after a kill; see `jaxrl_vis.run.storage.recent`.
 
         Raises:
-            NonFiniteError, StorageError: As `light`.
+            NonFiniteError, StorageError: As `save_light`.
         """
         started = time.monotonic()
         self._check()
@@ -134,24 +134,24 @@ class Saver:
         if distributed.is_first():
             self._checkpoints.recent.clear()
 
-    def on_signal(self, loop: LoopState, iteration: int, progress: Progress, interruption: Interruption) -> None:
+    def save_on_signal(self, loop: LoopState, iteration: int, progress: Progress, interruption: Interruption) -> None:
         """Save the learner, then the complete state. If the disk fills up in between, the light checkpoint stays, with a
         message.
 
         Raises:
-            NonFiniteError, StorageError: As `light`.
+            NonFiniteError, StorageError: As `save_light`.
         """
-        hint = f"{interruption.hurry} at once, without the replay"
+        hint = f"{interruption.quit_hint} at once, without the replay"
         self._echo(f"{interruption.name}: saving iteration {iteration} ({hint}) ...")
         if self.is_recent_due(light=True):  # in case the user does not wait
-            self.recent(loop, iteration, progress)
+            self.save_recent(loop, iteration, progress)
         self._checkpoints.wait()  # one of this iteration may still be on its way: it is not written twice
         if not self.has(LIGHT, iteration) or progress.evaluation_due:
-            self.light(loop, iteration, progress)
+            self.save_light(loop, iteration, progress)
         self._checkpoints.wait()
         if not self.has(FULL, iteration) or progress.evaluation_due:
             try:
-                self.full(loop, iteration, progress)
+                self.save_full(loop, iteration, progress)
             except StorageError as error:
                 missing = "there is no full checkpoint" if self.has(RECENT, iteration) else "the replay is not"
                 self._echo(f"the networks are saved, {missing}: {error}; {self.resume}")
@@ -170,19 +170,19 @@ class Saver:
             return
         with contextlib.suppress(Exception):
             if self.is_recent_due(light=True):
-                self.recent(loop, iteration, progress)
+                self.save_recent(loop, iteration, progress)
         with contextlib.suppress(Exception):
-            self.light(loop, iteration, progress)
+            self.save_light(loop, iteration, progress)
             self._checkpoints.wait()
 
     @property
     def resume(self) -> str:
-        """Command line options that resume the run, quoted for a shell."""
+        """Hint for messages: the command-line options that resume the run, quoted for a shell."""
         return f"go on with --run-dir {shlex.quote(str(self._folder.path))} --resume"
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
-        """Context that converts OSErrors into a `StorageError`; for file operations of the run only."""
+        """Convert OSErrors within this context into a `StorageError`; for file operations of the run only."""
         try:
             yield
         except OSError as error:
@@ -207,7 +207,15 @@ class Saver:
     def stop_nonfinite(
         self, loop: LoopState, iteration: int, place: str, values: PerSeed, broken: list[str] | None = None
     ) -> None:
-        """Dump the state and raise NonFiniteError."""
+        """Dump the state, unless it is distributed over several processes, and raise NonFiniteError.
+
+        Args:
+            loop: The state.
+            iteration: Iterations completed.
+            place: Location of the non-finite numbers, for the message.
+            values: Metrics of the failed iteration or evaluation.
+            broken: Names of the non-finite leaves of ``loop``; None to search for them.
+        """
         with contextlib.suppress(StorageError):
             self._checkpoints.wait()
         newest = self._checkpoints.newest()
@@ -215,7 +223,7 @@ class Saver:
         leaves = [name.removeprefix("train.") for name in leaves if name.startswith("train.")]
         file = self._folder.nonfinite / f"iteration_{iteration}.npz"
         simulated, dumped = None, "the state is distributed over several processes and is not dumped"
-        if not distributed.are_several():
+        if not distributed.is_multi_process():
             try:
                 dump(file, loop, values, leaves)
                 dumped = f"state dumped to {file}"

@@ -123,7 +123,7 @@ class Interruption(_Handlers):
 
     Attributes:
         signal: The first signal received, or None.
-        is_urgent: True if Ctrl-C, SIGTERM or SIGQUIT came twice.
+        is_urgent: True after a second signal out of Ctrl-C, SIGTERM, SIGQUIT and SIGBREAK.
     """
 
     def __init__(self) -> None:
@@ -151,7 +151,7 @@ class Interruption(_Handlers):
         return signal_name(self.signal or signal.SIGTERM)
 
     @property
-    def hurry(self) -> str:
+    def quit_hint(self) -> str:
         """Hint for messages: the input that ends the process without waiting."""
         return "once more quits" if self.signal in _DELIBERATE else "Ctrl-C or SIGTERM, twice, quits"
 
@@ -190,29 +190,29 @@ class Ending(_Handlers):
     """Context in which `SIGNALS` raise `Terminated` or KeyboardInterrupt in the main thread, as Ctrl-C does anyway.
 
     Args:
-        should_stop: Called in another thread with a signal that has not ended this process after some seconds, because the main
-            thread does not return to Python. It must end the process. None: no such watchdog.
+        force_exit: Called in another thread with a signal that has not ended this process after 10 s, because the main thread
+            does not return to Python. It must end the process. None: no such watchdog.
 
     Attributes:
         signal: The first signal received, except those handled by an `Interruption`; None if there was none.
     """
 
-    def __init__(self, should_stop: Callable[[int], None] | None = None) -> None:
+    def __init__(self, force_exit: Callable[[int], None] | None = None) -> None:
         super().__init__()
         self.signal: int | None = None
-        self._should_stop = should_stop
+        self._force_exit = force_exit
         self._wakeup_sockets: list[socket.socket] = []
         self._wakeup_before = -1
 
     def __enter__(self) -> Self:
         self._install(self._end)
-        if self._should_stop is not None and self._before:
+        if self._force_exit is not None and self._before:
             # Python's C-level handler, which runs at once whatever the main thread does, writes the signal's number here.
             reader, writer = socket.socketpair()
             writer.setblocking(False)
             self._wakeup_sockets = [reader, writer]
             self._wakeup_before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-            threading.Thread(target=self._watch, args=(reader, self._should_stop), daemon=True).start()
+            threading.Thread(target=self._watch, args=(reader, self._force_exit), daemon=True).start()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -228,14 +228,14 @@ class Ending(_Handlers):
         self.signal = self.signal or number
         _raise(number)
 
-    def _watch(self, reader: socket.socket, should_stop: Callable[[int], None]) -> None:
+    def _watch(self, reader: socket.socket, force_exit: Callable[[int], None]) -> None:
         shield_this_thread()
         with reader:
             while received := reader.recv(1):
                 # An `Interruption` has handlers of its own: the code that it guards has no time limit.
                 if received[0] in SIGNALS and signal.getsignal(received[0]) == self._end:
                     time.sleep(_PATIENCE_S)
-                    should_stop(received[0])
+                    force_exit(received[0])
 
 
 def obey_parent_only() -> None:

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated
-from jaxrl_vis.host.devices import check_devices, enable_compilation_cache, hush_cache, start_devices
-from jaxrl_vis.host.plugins import own_names
+from jaxrl_vis.host.devices import check_devices, enable_compilation_cache, silence_cache_warnings, start_devices
+from jaxrl_vis.host.plugins import custom_names
 from jaxrl_vis.host.streams import safe_streams
 from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
@@ -41,10 +41,10 @@ class Trainer:
         config: The run.
         program: From `jaxrl_vis.learner.train_step.make_train_step`, or anything with the same attributes.
         run_dir: Folder of the files of `run`; None for `jaxrl_vis.run.storage.folder.default_folder`.
-        resume: Continue the run in ``run_dir``.
-        overwrite: Delete the run in ``run_dir`` and start again.
+        resume: Whether to continue the run in ``run_dir``.
+        overwrite: Whether to delete the run in ``run_dir`` and start again.
         log: Loggers in addition to metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the resumed run.
-        cache_programs: Cache traced programs between processes (`jaxrl_vis.run.compiled.trace_cache`).
+        cache_programs: Whether to cache traced programs between processes (`jaxrl_vis.run.compiled.trace_cache`).
 
     Attributes:
         config: The run.
@@ -52,6 +52,9 @@ class Trainer:
         programs: The compiled functions and their sizes.
         folder: The run folder.
         seeds: The seeds, in the order of the seed axis.
+
+    Raises:
+        RequestError: ``run_dir`` cannot be used for ``config``, or a logger is unknown or its library is missing.
     """
 
     def __init__(
@@ -183,15 +186,16 @@ def make_trainer(
     Args:
         config: The run.
         run_dir: Folder of the files of `Trainer.run`; None for one below ``runs/``, named after the configuration.
-        resume: Continue the run in that folder; an empty one starts a new run, with a message.
-        overwrite: Delete the run in that folder and start again.
+        resume: Whether to continue the run in that folder; an empty one starts a new run, with a message.
+        overwrite: Whether to delete the run in that folder and start again.
         log: Loggers in addition to metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the resumed run.
-        cache_programs: Cache traced programs between processes. Only for processes that do not modify this package's modules,
-            which the cache would not detect (`jaxrl_vis.run.compiled.trace_cache`).
-        policy_alone: The learner is only a policy, which cannot be trained (`Algorithm.of_policies`).
+        cache_programs: Whether to cache traced programs between processes. Only for processes that do not modify this package's
+            modules, which the cache would not detect (`jaxrl_vis.run.compiled.trace_cache`).
+        policy_alone: Whether the learner is only a policy, which cannot be trained (`Algorithm.of_policies`).
 
     Raises:
-        RequestError: The configuration is contradictory, or differs from the saved run.
+        RequestError: The configuration is contradictory, differs from the saved run, or needs devices that are missing; the
+            folder has other contents; or a logger is unknown or its library is missing.
     """
     if not isinstance(config, Config):
         raise RequestError(f"make_trainer takes a configuration, such as jaxrl_vis.preset('cpu'), not {config!r}")
@@ -199,10 +203,10 @@ def make_trainer(
     if run_dir is not None:
         RunFolder(Path(run_dir)).check(config, resume, overwrite)  # building an environment takes a while: refuse before
     with safe_streams():  # libraries that print, or warn, as they are imported and compile
-        hush_cache()
+        silence_cache_warnings()
         with shielded_children():  # threads that JAX starts with its first use of a device never see signals
             start_devices()
-            if is_built_in(config.environment.env) and not own_names(config):
+            if is_built_in(config.environment.env) and not custom_names(config):
                 locate_env(config)  # imports MuJoCo, meanwhile
             check_devices()
         config = locate_env(config)

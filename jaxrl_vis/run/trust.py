@@ -16,8 +16,8 @@ from pathlib import Path
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.host.files import make_private, read_private, replacing, stranger_to, user_cache
-from jaxrl_vis.host.plugins import own_names
+from jaxrl_vis.host.files import foreign_writer, make_private, read_private, replacing, user_cache
+from jaxrl_vis.host.plugins import custom_names
 from jaxrl_vis.run.storage.folder import read_run_id
 from jaxrl_vis_envs import task_modules
 
@@ -27,7 +27,7 @@ _trusted_here: set[str] = set()  # by this process, if the cache is not writable
 
 def is_own(config: Config) -> bool:
     """Return True if a part of a configuration is custom code."""
-    return bool(own_names(config))
+    return bool(custom_names(config))
 
 
 def is_trusted(run_dir: Path, config: Config) -> bool:
@@ -46,7 +46,7 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
     Args:
         run_dir: The run folder.
         config: Its configuration.
-        was_trained_here: Also permit later changes of the files by the user, except of files in the run folder.
+        was_trained_here: Whether to permit later changes of the files by the user, too, except of files in the run folder.
     """
     changing, as_it_is = _names(run_dir, config)
     is_inside = any(_is_inside(run_dir, file) for file in _files(config).values())
@@ -61,13 +61,13 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
             path.unlink(missing_ok=True)
 
 
-def check(run_dir: Path, config: Config, may: bool, hint: str = "pass trust=True") -> None:
-    """Check that the code of a run may be imported; the permission ``may`` is stored.
+def check(run_dir: Path, config: Config, is_permitted: bool, hint: str = "pass trust=True") -> None:
+    """Check that the code of a run may be imported; the permission ``is_permitted`` is stored.
 
     Args:
         run_dir: The run folder.
         config: Its configuration.
-        may: Permission by the user.
+        is_permitted: Whether the user gives the permission.
         hint: Hint on how to give the permission, for the message.
 
     Raises:
@@ -75,16 +75,16 @@ def check(run_dir: Path, config: Config, may: bool, hint: str = "pass trust=True
     """
     if not is_own(config) or is_trusted(run_dir, config):
         return
-    if not may:
-        raise RequestError(f"{question(run_dir, config)}: look at it, and if you trust it, {hint}")
+    if not is_permitted:
+        raise RequestError(f"{describe_code(run_dir, config)}: look at it, and if you trust it, {hint}")
     trust(run_dir, config)
 
 
-def question(run_dir: Path, config: Config) -> str:
-    """Return the question about trust, for messages."""
+def describe_code(run_dir: Path, config: Config) -> str:
+    """Return the clause of messages that lists the custom code of a run, and the files that it is imported from."""
     files = _files(config)
-    parts = [f"its {kind} {name} is imported from {files[name]}" for kind, name in own_names(config).items()]
-    return f"the run in {run_dir} runs code that is not of this project: {', '.join(parts)}"
+    reasons = [f"its {kind} {name} is imported from {files[name]}" for kind, name in custom_names(config).items()]
+    return f"the run in {run_dir} runs code that is not of this project: {', '.join(reasons)}"
 
 
 def _folder() -> Path:
@@ -93,15 +93,19 @@ def _folder() -> Path:
 
 def _is_stored(name: str) -> bool:
     try:
-        return stranger_to(_folder().stat()) is None and read_private(_folder() / name) is not None
+        return foreign_writer(_folder().stat()) is None and read_private(_folder() / name) is not None
     except OSError:
         return False
 
 
 def _files(config: Config) -> dict[str, Path | None]:
-    """Locate the modules of a run's custom parts, by name, without importing anything; None if there is none."""
+    """Locate the modules of a run's custom parts, by name, without importing anything; None for one that is not found.
+
+    Raises:
+        RequestError: A name is not of the form ``module:Name``, or the folder of modules is invalid.
+    """
     files = {}
-    for kind, name in own_names(config).items():
+    for kind, name in custom_names(config).items():
         try:
             files[name] = task_modules.find(task_modules.split(name)[0], config.environment.env_folder)
         except (ValueError, OSError) as error:  # not of this form, or an invalid folder

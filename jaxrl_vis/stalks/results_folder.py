@@ -35,7 +35,7 @@ def pair_state(pair: PairFiles) -> dict[str, list[int] | None]:
 
 
 def write_record(path: Path, record: Mapping[str, Any], sources: Any) -> None:
-    """Write a record as JSON.
+    """Write a record as JSON, atomically.
 
     Args:
         path: The file.
@@ -48,23 +48,23 @@ def write_record(path: Path, record: Mapping[str, Any], sources: Any) -> None:
     write_atomically(path, json.dumps({**record, _SOURCES: sources}) + "\n")
 
 
-def is_current(path: Path, sources: Any, is_whole: Callable[[dict[str, Any]], bool]) -> bool:
-    """Return whether a record exists, is complete, and was made from the current sources.
+def is_current(path: Path, sources: Any, is_complete: Callable[[dict[str, Any]], bool]) -> bool:
+    """Return True if a record exists, is complete, and was made from the current sources.
 
     Args:
         path: The file.
         sources: Current state of its sources.
-        is_whole: Return whether a record is complete; it may raise ValueError, KeyError, TypeError or AttributeError for a
-            malformed one.
+        is_complete: Function that returns True for a complete record; it may raise ValueError, KeyError, TypeError or
+            AttributeError for a malformed one.
     """
     try:
         record = read_json(path)
-        return is_whole(record) and record[_SOURCES] == sources
+        return is_complete(record) and record[_SOURCES] == sources
     except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
         return False
 
 
-def claim(
+def claim_folder(
     out: Path,
     unit: str,
     folders: Iterable[PlotFolder],
@@ -113,7 +113,7 @@ def claim(
 
 
 def _differences(recorded: Mapping[str, Any], current: Mapping[str, Any]) -> str:
-    """Describe the relevant differences between two requests; empty if there are none."""
+    """Describe the relevant differences between two requests in one line; empty if there are none."""
     differences = []
     for name in dict.fromkeys([*current, *recorded]):
         old, new = recorded.get(name), current.get(name)

@@ -60,7 +60,7 @@ def losses(point: jax.Array) -> dict[str, jax.Array]:
 
 
 def descend(weighting: Weighting) -> Paths:
-    """Run gradient descent from all starts in parallel."""
+    """Run gradient descent from all `STARTS` in parallel, with `STEPS` steps; return the paths."""
     gradient = weighted_grad(losses, weighting)
 
     def path(start: jax.Array):

@@ -49,12 +49,12 @@ def losses(point: jax.Array) -> dict[str, jax.Array]:
 
 
 def authors_rule() -> Weighting:
-    """Return the weighting of the example."""
+    """Build the authors' weighting for this example: OL-AUX-1 on the losses themselves, multiplicative and unbounded."""
     return make_weighting("ol_aux", interval=1, learning_rate=1.0, beta=STEP_SIZE, log=False, minimum=None, multiplicative=True)
 
 
 def descend(weighting: Weighting) -> Paths:
-    """Run gradient descent from all starts in parallel."""
+    """Run gradient descent from all `STARTS` in parallel, with `STEPS` steps; return the paths."""
     gradient = weighted_grad(losses, weighting)
     names = (MAIN, *AUXILIARY)
 

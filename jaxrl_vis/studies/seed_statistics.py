@@ -42,7 +42,7 @@ def permutation_p_value(first: np.ndarray, second: np.ndarray) -> float:
     """Compute the two-sided p-value of the difference of two means, by all permutations of seeds between the groups.
 
     Args:
-        first, second: Scores of the groups, [S] and [T]; at most ten seeds each, with 184,756 permutations.
+        first, second: Scores of the groups, [S] and [T]; at most 20 seeds in total, with up to 184,756 permutations.
 
     Raises:
         ValueError: There are too many permutations for an exact test.

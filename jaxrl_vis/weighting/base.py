@@ -159,7 +159,7 @@ def log_loss(loss: jax.Array, eps: float) -> jax.Array:
 
 
 def log_slope(loss: jax.Array, eps: float) -> jax.Array:
-    """Compute the derivative of `log_loss`: 1 / (max(L, 0) + eps), without gradient."""
+    """Compute the derivative of `log_loss`, 1 / (max(L, 0) + eps), [] float, without gradient."""
     return 1.0 / (jnp.maximum(jax.lax.stop_gradient(loss), 0.0) + eps)
 
 
@@ -197,20 +197,20 @@ def check_names(losses: Losses, state: WeightingState) -> None:
         raise RequestError(f"losses are {known}, but the weighting began with {expected}; give init the names of all losses")
 
 
-def dot(one: Params, other: Params) -> jax.Array:
+def dot(left: Params, right: Params) -> jax.Array:
     """Compute the scalar inner product of two trees in float32 or wider, regardless of their dtypes.
 
     Elementwise products are summed instead of using a matrix unit, which on accelerators would round factors to 10 bits.
     """
 
-    def products(left: jax.Array, right: jax.Array) -> jax.Array:
-        dtype = jnp.promote_types(jnp.promote_types(left.dtype, right.dtype), jnp.float32)
-        return jnp.sum(left.astype(dtype) * right.astype(dtype))
+    def products(first: jax.Array, second: jax.Array) -> jax.Array:
+        dtype = jnp.promote_types(jnp.promote_types(first.dtype, second.dtype), jnp.float32)
+        return jnp.sum(first.astype(dtype) * second.astype(dtype))
 
-    return sum(jax.tree.leaves(jax.tree.map(products, one, other)), jnp.zeros(()))
+    return sum(jax.tree.leaves(jax.tree.map(products, left, right)), jnp.zeros(()))
 
 
-def scaled(tree: Params, factor: jax.Array | float) -> Params:
+def scale_tree(tree: Params, factor: jax.Array | float) -> Params:
     """Multiply all leaves of a tree by a scalar."""
     return jax.tree.map(lambda leaf: factor * leaf, tree)
 
@@ -235,12 +235,12 @@ def loss_order(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def to_vector(by_name: Mapping[str, jax.Array]) -> jax.Array:
-    """Stack the scalars of all losses: [K], float32 or wider."""
+    """Stack the scalars of all losses in the order of `loss_order`: [K], float32 or wider."""
     return jnp.stack([to_float32(jnp.asarray(by_name[name])) for name in loss_order(by_name)])
 
 
 def by_name(names: Iterable[str], vector: jax.Array) -> dict[str, jax.Array]:
-    """Split a vector [K] into scalars by the names of the losses."""
+    """Split a vector [K], in the order of `loss_order`, into scalars by the names of the losses."""
     return {name: vector[index] for index, name in enumerate(loss_order(names))}
 
 
@@ -292,7 +292,7 @@ def auxiliary_names(weighting: str, names: Iterable[str], needed: bool = True) -
     return tuple(name for name in names if name != MAIN)
 
 
-def checked(weighting: Weighting) -> Weighting:
+def check_eps(weighting: Weighting) -> Weighting:
     """Check the ``eps`` and ``main_eps`` of a weighting, and return it.
 
     Raises:
@@ -306,40 +306,40 @@ def checked(weighting: Weighting) -> Weighting:
     return weighting
 
 
-def start(names: Iterable[str], weights: Mapping[str, float], **more: Any) -> WeightingState:
+def start(names: Iterable[str], weights: Mapping[str, float], **fields: Any) -> WeightingState:
     """Return the initial state of a weighting with a main loss.
 
     Args:
         names: Names of the auxiliary losses.
         weights: Initial weights of the auxiliary losses, by name.
-        more: Values of other fields.
+        fields: Values of other fields.
     """
     filled = {MAIN: jnp.ones(())} | {name: jnp.asarray(weights[name], jnp.ones(()).dtype) for name in names}
-    return WeightingState(weights=filled, updates=jnp.zeros((), jnp.int32), **more)
+    return WeightingState(weights=filled, updates=jnp.zeros((), jnp.int32), **fields)
 
 
-def start_alike(label: str, names: Iterable[str], **more: Any) -> WeightingState:
+def start_equal(label: str, names: Iterable[str], **fields: Any) -> WeightingState:
     """Return the initial state of a weighting without a main loss: equal weights that sum to 1.
 
     Args:
         label: Name of the weighting, for error messages.
         names: Names of all losses.
-        more: Values of other fields.
+        fields: Values of other fields.
     """
     ordered = all_names(label, names)
     weights = {name: jnp.full((), 1.0 / len(ordered), jnp.ones(()).dtype) for name in ordered}
-    return WeightingState(weights=weights, updates=jnp.zeros((), jnp.int32), **more)
+    return WeightingState(weights=weights, updates=jnp.zeros((), jnp.int32), **fields)
 
 
-def next_state(state: WeightingState, weights: Weights, **more: Any) -> tuple[WeightingState, Metrics]:
+def next_state(state: WeightingState, weights: Weights, **fields: Any) -> tuple[WeightingState, Metrics]:
     """Return the state after an update, and metrics ``weight/NAME`` of all losses.
 
     Args:
         state: Previous state.
         weights: Weights of this step; or of the next one, if they do not depend on the gradients that they combine.
-        more: New values of other fields.
+        fields: New values of other fields.
     """
-    after = keep_dtypes(state.replace(weights=weights, updates=state.updates + 1, **more), state)
+    after = keep_dtypes(state.replace(weights=weights, updates=state.updates + 1, **fields), state)
     return after, {f"weight/{name}": weight for name, weight in after.weights.items()}
 
 
@@ -364,7 +364,7 @@ def zeros_for(label: str, names: Iterable[str], shared: Params, *leading: int) -
     return {name: jax.tree.map(zeros, shared) for name in names}
 
 
-def report(weights: Weights, dots: Mapping[str, jax.Array] | None = None) -> Metrics:
-    """Return the metrics ``weight/NAME`` of each auxiliary loss, and ``dot/NAME`` if ``dots`` is given."""
+def weight_metrics(weights: Weights, dots: Mapping[str, jax.Array] | None = None) -> Metrics:
+    """Return the metrics ``weight/NAME`` of each auxiliary loss, and ``dot/NAME`` if ``dots`` is given, [] float32 each."""
     shown = {f"weight/{name}": weight for name, weight in weights.items() if name != MAIN}
     return shown | {f"dot/{name}": value for name, value in (dots or {}).items()}

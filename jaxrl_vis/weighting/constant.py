@@ -17,10 +17,10 @@ from jaxrl_vis.weighting.base import (
     WeightingState,
     Weights,
     auxiliary_names,
-    checked,
-    report,
+    check_eps,
     start,
-    start_alike,
+    start_equal,
+    weight_metrics,
 )
 
 
@@ -30,7 +30,14 @@ def none() -> Weighting:
 
 
 def none_log(main_eps: float = 1e-8) -> Weighting:
-    """Use the logarithm of the main loss alone, to separate its effect from that of auxiliary losses."""
+    """Use the logarithm of the main loss alone, to separate its effect from that of auxiliary losses.
+
+    Args:
+        main_eps: See `Weighting`.
+
+    Raises:
+        RequestError: ``main_eps`` is not positive.
+    """
     return _constant("none_log", 0.0, auxiliary=False, log=True, main_eps=main_eps)
 
 
@@ -40,7 +47,14 @@ def plain_sum() -> Weighting:
 
 
 def balance(eps: Eps = 0.02, main_eps: float = 1e-8) -> Weighting:
-    """Sum the logarithms of all losses (thesis 5.2.3.3, "Gradient Balancing")."""
+    """Sum the logarithms of all losses (thesis 5.2.3.3, "Gradient Balancing").
+
+    Args:
+        eps, main_eps: See `Weighting`.
+
+    Raises:
+        RequestError: ``eps`` or ``main_eps`` is not positive.
+    """
     return _constant("balance", 1.0, log=True, eps=eps, main_eps=main_eps)
 
 
@@ -53,7 +67,8 @@ def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: Eps
         eps, main_eps: See `Weighting`.
 
     Raises:
-        RequestError: A weight is not finite; from ``init``: a loss has no weight, or a weight has no loss.
+        RequestError: A weight is not finite, or ``eps`` or ``main_eps`` is not positive; from ``init``: a loss has no weight,
+            or a weight has no loss.
     """
     for weight in weights.values() if isinstance(weights, Mapping) else [weights]:
         if not math.isfinite(weight):
@@ -64,13 +79,16 @@ def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: Eps
 def cosine(log: bool = False, eps: Eps = 0.02, main_eps: float = 1e-8, heads: Heads = "always") -> Weighting:
     """Use an auxiliary loss in the shared parameters, with weight 1, only if its gradient does not oppose the main one's.
 
-    Weight 1 where the cosine of the two gradients is at least 0 (Du et al., 2018; thesis 5.2.3.3, "Cosine Similarity"). Only
-    the sign matters, so no norm is needed, and logarithms do not change the weights.
+    The weight is 1 if the cosine of the two gradients is at least 0, else 0 (Du et al., 2018; thesis 5.2.3.3, "Cosine
+    Similarity"). Only the sign matters, so no norm is needed, and logarithms do not change the weights.
 
     Args:
         log: Whether to minimise the logarithms of the losses.
         eps, main_eps: See `Weighting`.
         heads: See `Weighting`; always in the thesis, so that the head of a loss with weight 0 continues to be trained.
+
+    Raises:
+        RequestError: ``eps`` or ``main_eps`` is not positive.
     """
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
@@ -80,19 +98,21 @@ def cosine(log: bool = False, eps: Eps = 0.02, main_eps: float = 1e-8, heads: He
     def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
         slopes = weighting.slopes(losses)
         dots = {name: slopes[MAIN] * slopes[name] * statistics[name] for name in state.weights if name != MAIN}
-        one = state.weights[MAIN]
+        main_weight = state.weights[MAIN]
         # Use the sign of the dot product itself: slopes are positive, but a small product might underflow.
-        weights = {MAIN: one} | {name: jnp.where(statistics[name] >= 0.0, one, 0.0 * one) for name in dots}
-        return weights, state.replace(weights=weights, updates=state.updates + 1), report(weights, dots)
+        weights = {MAIN: main_weight} | {
+            name: jnp.where(statistics[name] >= 0.0, main_weight, 0.0 * main_weight) for name in dots
+        }
+        return weights, state.replace(weights=weights, updates=state.updates + 1), weight_metrics(weights, dots)
 
-    weighting = checked(Weighting("cosine", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps, heads=heads))
+    weighting = check_eps(Weighting("cosine", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps, heads=heads))
     return weighting
 
 
-def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool = True, **more: Any) -> Weighting:
+def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool = True, **options: Any) -> Weighting:
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        if not more.get("main", True):
-            ones = start_alike(name, names)
+        if not options.get("main", True):
+            ones = start_equal(name, names)
             return ones.replace(weights={loss: jnp.ones_like(weight) for loss, weight in ones.weights.items()})
         others = auxiliary_names(name, names, needed=auxiliary)
         if not isinstance(weights, Mapping):
@@ -104,7 +124,7 @@ def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool =
         return start(others, weights)
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
-        return state.weights, state.replace(updates=state.updates + 1), report(state.weights) if auxiliary else {}
+        return state.weights, state.replace(updates=state.updates + 1), weight_metrics(state.weights) if auxiliary else {}
 
-    reads_losses = more.get("log", False)
-    return checked(Weighting(name, init, update, auxiliary=auxiliary, reads_losses=reads_losses, **more))
+    reads_losses = options.get("log", False)
+    return check_eps(Weighting(name, init, update, auxiliary=auxiliary, reads_losses=reads_losses, **options))

@@ -22,11 +22,11 @@ from jaxrl_vis.weighting.base import (
     WeightingState,
     all_names,
     by_name,
-    checked,
+    check_eps,
     dot,
     next_state,
-    scaled,
-    start_alike,
+    scale_tree,
+    start_equal,
     to_float32,
     to_vector,
     weighted_sum,
@@ -51,10 +51,10 @@ def graddrop(leak: float = 0.0, seed: int = 0) -> Weighting:
     Raises:
         RequestError: ``leak`` is not between 0 and 1.
     """
-    _check_share("graddrop", "leak", leak)
+    _check_fraction("graddrop", "leak", leak)
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        state = start_alike("graddrop", names, key=jax.random.key(seed))
+        state = start_equal("graddrop", names, key=jax.random.key(seed))
         return state.replace(weights={name: jnp.ones_like(weight) for name, weight in state.weights.items()})
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
@@ -92,7 +92,7 @@ def db_mtl(beta: float = 0.9, sigma: float = 0.0, eps: Eps = 1e-8, main_eps: flo
     """Balance losses by logarithms, and their averaged gradients by norm (DB-MTL; Lin et al., 2023, "Dual-Balancing").
 
     Each gradient of log(L_i + eps) is averaged over steps, m_i <- g_i + (beta / t^sigma) (m_i - g_i), initially 0; the
-    direction is the sum of all m_i, each rescaled to the norm of the longest. Suited to losses of any units. The noise of a
+    direction is the sum of all m_i, each rescaled to the largest of their norms. Suited to losses of any units. The noise of a
     loss close to its minimum is amplified to that norm as well.
 
     Args:
@@ -101,19 +101,21 @@ def db_mtl(beta: float = 0.9, sigma: float = 0.0, eps: Eps = 1e-8, main_eps: flo
         eps, main_eps: See `Weighting`.
 
     Raises:
-        RequestError: ``beta`` is not between 0 and 1.
+        RequestError: ``beta`` is not between 0 and 1, or ``eps`` or ``main_eps`` is not positive.
     """
-    _check_share("db_mtl", "beta", beta)
+    _check_fraction("db_mtl", "beta", beta)
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
         names = all_names("db_mtl", names)
-        return start_alike("db_mtl", names, memory=zeros_for("db_mtl", names, shared))
+        return start_equal("db_mtl", names, memory=zeros_for("db_mtl", names, shared))
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
         slopes = weighting.slopes(losses)
         past = beta / (state.updates + 1.0) ** sigma
         averages = {
-            name: jax.tree.map(lambda new, old: new + past * (old - new), scaled(statistics[name], slope), state.memory[name])
+            name: jax.tree.map(
+                lambda new, old: new + past * (old - new), scale_tree(statistics[name], slope), state.memory[name]
+            )
             for name, slope in slopes.items()
         }
         lengths = {name: jnp.sqrt(dot(average, average)) for name, average in averages.items()}
@@ -124,7 +126,7 @@ def db_mtl(beta: float = 0.9, sigma: float = 0.0, eps: Eps = 1e-8, main_eps: flo
         }
         return Direction(weighted_sum(averages, weights), weights), *next_state(state, weights, memory=averages)
 
-    weighting = checked(
+    weighting = check_eps(
         Weighting("db_mtl", init, update, needs="gradients", log=True, eps=eps, main_eps=main_eps, heads="always", main=False)
     )
     return weighting
@@ -146,11 +148,11 @@ def moco(beta: float = 0.5, gamma: float = 0.1, sigma: float = 0.5, rho: float =
     Raises:
         RequestError: ``beta`` is not between 0 and 1.
     """
-    _check_share("moco", "beta", beta)
+    _check_fraction("moco", "beta", beta)
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
         names = all_names("moco", names)
-        return start_alike("moco", names, memory=zeros_for("moco", names, shared))
+        return start_equal("moco", names, memory=zeros_for("moco", names, shared))
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
         decay = (state.updates + 1.0) ** -sigma
@@ -166,7 +168,7 @@ def moco(beta: float = 0.5, gamma: float = 0.1, sigma: float = 0.5, rho: float =
     return Weighting("moco", init, update, needs="gradients", heads="always", main=False, reads_losses=False)
 
 
-def _check_share(label: str, name: str, value: float) -> None:
+def _check_fraction(label: str, name: str, value: float) -> None:
     """Raise a RequestError if a number is not between 0 and 1."""
     if not 0.0 <= value <= 1.0:
         raise RequestError(f"{name} of weighting {label} must be between 0 and 1, not {value}")

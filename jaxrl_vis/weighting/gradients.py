@@ -69,8 +69,8 @@ class Weighted(NamedTuple):
     extra: Any = None
 
 
-def everything(params: Params) -> Params:
-    """Select all parameters as shared."""
+def identity(params: Params) -> Params:
+    """Return the argument: selects all parameters as shared, and reduces nothing."""
     return params
 
 
@@ -138,10 +138,10 @@ def gramian(gradients: Mapping[str, Params]) -> jax.Array:
 def weighted_grad(
     losses_fn: LossesFunction,
     weighting: Weighting,
-    shared: Selector = everything,
+    shared: Selector = identity,
     mode: GradientMode = "per_loss",
     has_aux: bool = False,
-    reduce: Callable[[Any], Any] = everything,
+    reduce: Callable[[Any], Any] = identity,
     forwards: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext,
     encode: Encode | None = None,
 ) -> Callable[..., Weighted]:
@@ -168,8 +168,9 @@ def weighted_grad(
         (params, state, *args) -> `Weighted`, with state from ``weighting.init(names, shared(params))``.
 
     Raises:
-        RequestError: The method is unknown, or does not support the weighting; from the returned function: ``losses_fn`` does
-            not return a dictionary of scalars, or the losses are not those with which the state was initialised.
+        RequestError: The method is unknown, does not support the weighting, or is latents without ``encode``; from the returned
+            function: ``losses_fn`` does not return a dictionary of scalars, or the losses are not those with which the state
+            was initialised.
     """
     if mode not in get_args(GradientMode):
         raise RequestError(f"unknown gradient mode {mode!r}{nearest(mode, get_args(GradientMode))}")
@@ -233,23 +234,23 @@ def _gradient_by_latents(
     state: WeightingState,
     *args: Any,
 ) -> Weighted:
-    """Compute the weighted gradient with one pass through the shared parameters; arguments as for `weighted_grad`."""
-    through = latents.encode(encode, shared(params), *args)
+    """Compute the weighted gradient from the gradients with respect to latents; arguments as for `weighted_grad`."""
+    encoding = latents.encode(encode, shared(params), *args)
     # Trace the losses to find which latents and parameters each of them reads.
-    program, results = jax.make_jaxpr(losses_fn, return_shape=True)(params, through.read, *args)
-    differentiated = latents.differentiate(losses_fn, has_aux, through, (program, results), params, *args)
+    program, results = jax.make_jaxpr(losses_fn, return_shape=True)(params, encoding.argument, *args)
+    differentiated = latents.differentiate(losses_fn, has_aux, encoding, (program, results), params, *args)
     check_names(differentiated.losses, state)
     losses = reduce(differentiated.losses)
     statistics = of_main = None
     if weighting.needs == "dots":
-        of_main = through.backward(differentiated.at_latents, {MAIN: jnp.ones(())})
+        of_main = encoding.backward(differentiated.at_latents, {MAIN: jnp.ones(())})
         others = {name: at for name, at in differentiated.at_latents.items() if name != MAIN}
         with forwards():
-            dots = through.dots(reduce(of_main), others)
+            dots = encoding.dots(reduce(of_main), others)
         statistics = reduce(dots)
     elif weighting.needs == "gramian":
         with forwards():
-            statistics = reduce(through.gramian(differentiated.at_latents, reduce))
+            statistics = reduce(encoding.gramian(differentiated.at_latents, reduce))
     step, state, metrics = weighting.update(losses, statistics, state)
     assert not isinstance(step, Direction)  # only weightings that need whole gradients return one
     weights = step
@@ -257,7 +258,7 @@ def _gradient_by_latents(
     rest = coefficients
     if of_main is not None:
         rest = {name: coefficient for name, coefficient in coefficients.items() if name != MAIN}
-    added = through.backward(differentiated.at_latents, rest)
+    added = encoding.backward(differentiated.at_latents, rest)
     if of_main is not None:  # add the main loss's gradient, which is known already
         added = jax.tree.map(lambda main, other: coefficients[MAIN] * main + other, of_main, added)
     in_heads = differentiated.combine_heads(params, weighting.coefficients(weighting.head_weights(weights), losses))
@@ -268,13 +269,15 @@ def _gradient_by_latents(
 def _replace_subtree(shared: Selector, params: Params, inside: Params, outside: Params) -> Params:
     """Merge two trees like the parameters: shared parameters from ``inside``, all others from ``outside``."""
     is_shared = _embed(shared, params, jax.tree.map(jnp.ones_like, shared(outside)))
-    return jax.tree.map(lambda chosen, one, other: jnp.where(chosen > 0, one, other), is_shared, inside, outside)
+    return jax.tree.map(
+        lambda mask, shared_leaf, other_leaf: jnp.where(mask > 0, shared_leaf, other_leaf), is_shared, inside, outside
+    )
 
 
-def _embed(shared: Selector, params: Params, part: Params) -> Params:
-    """Place ``part`` in the shared parameters and zero in all others, in the dtypes of ``part`` or float32."""
-    dtype = jnp.result_type(jnp.float32, *jax.tree.leaves(part))
+def _embed(shared: Selector, params: Params, subset: Params) -> Params:
+    """Place ``subset`` in the shared parameters and zero in all others, in the dtypes of ``subset`` or float32."""
+    dtype = jnp.result_type(jnp.float32, *jax.tree.leaves(subset))
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, dtype), params)
-    part = jax.tree.map(lambda leaf: leaf.astype(dtype), part)
-    (placed,) = jax.linear_transpose(shared, shapes)(part)  # the transpose of a selection inserts its parts
+    subset = jax.tree.map(lambda leaf: leaf.astype(dtype), subset)
+    (placed,) = jax.linear_transpose(shared, shapes)(subset)  # the transpose of a selection inserts its parts
     return placed

@@ -23,9 +23,9 @@ from jaxrl_vis.weighting.base import (
     WeightingState,
     Weights,
     by_name,
-    checked,
+    check_eps,
     next_state,
-    start_alike,
+    start_equal,
     to_vector,
 )
 
@@ -37,7 +37,8 @@ class Options(TypedDict, total=False):
 
     Attributes:
         log: Whether logarithms of the losses are minimised and compared, which makes the result independent of their units.
-        eps, main_eps, heads: See `Weighting`. Default of ``heads`` is always: weights apply to the shared parameters alone.
+        eps, main_eps, heads: See `Weighting`. A RequestError is raised unless ``eps`` and ``main_eps`` are positive. Default of
+            ``heads`` is always: weights apply to the shared parameters alone.
     """
 
     log: bool
@@ -69,7 +70,7 @@ def of_gramian(
     """
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        state = start_alike(label, names, key=None if seed is None else jax.random.key(seed))
+        state = start_equal(label, names, key=None if seed is None else jax.random.key(seed))
         if memory is None:
             return state
         return state.replace(memory=memory(len(state.weights), next(iter(state.weights.values())).dtype))
@@ -80,7 +81,7 @@ def of_gramian(
         weights = by_name(losses, vector)
         return weights, *next_state(state, weights, memory=remembered)
 
-    weighting = checked(
+    weighting = check_eps(
         Weighting(
             label,
             init,
@@ -98,7 +99,7 @@ def of_gramian(
 
 
 def _plain(weights: Callable[[jax.Array], jax.Array]) -> Solve:
-    """Build a solver without memory."""
+    """Build a solver without memory from a function of the Gramian [K, K] that returns weights [K]."""
     return lambda gramian, state: (weights(gramian), None)
 
 
@@ -128,7 +129,7 @@ def upgrad(**options: Unpack[Options]) -> Weighting:
 
     def weights(gramian: jax.Array) -> jax.Array:
         preferences = jnp.eye(len(gramian), dtype=gramian.dtype) / len(gramian)
-        return jnp.sum(jax.vmap(lambda one: solvers.dual_cone(gramian, one))(preferences), axis=0)
+        return jnp.sum(jax.vmap(lambda preference: solvers.dual_cone(gramian, preference))(preferences), axis=0)
 
     return of_gramian("upgrad", _plain(weights), **options)
 

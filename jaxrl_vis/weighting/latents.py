@@ -24,13 +24,13 @@ AtLatents = Mapping[str, Mapping[str, Any]]
 """Gradients with respect to latents, by loss and by group of latents that it reads."""
 
 
-def like(tree: Params, other: Params) -> Params:
+def cast_like(tree: Params, template: Params) -> Params:
     """Cast the leaves of a tree to the dtypes of another."""
-    return jax.tree.map(lambda leaf, model: leaf.astype(model.dtype), tree, other)
+    return jax.tree.map(lambda leaf, template_leaf: leaf.astype(template_leaf.dtype), tree, template)
 
 
 @dataclasses.dataclass(frozen=True)
-class Through:
+class Encoding:
     """Latents, and their linearisations with respect to the shared parameters.
 
     Attributes:
@@ -48,25 +48,35 @@ class Through:
     has_names: bool
 
     @property
-    def read(self) -> Any:
+    def argument(self) -> Any:
         """Latents in the form that losses take."""
         return self.latents if self.has_names else self.latents[_ALL]
 
     def backward(self, at_latents: AtLatents, coefficients: Mapping[str, jax.Array]) -> Params:
-        """Compute the gradient of a weighted sum of losses in the shared parameters, float32."""
+        """Compute the gradient of a weighted sum of losses with respect to the shared parameters, float32 or wider.
+
+        Args:
+            at_latents: Gradients of the losses with respect to the latents.
+            coefficients: [] float32 by name; losses without one are left out.
+        """
         total = jax.tree.map(
             lambda leaf: jnp.zeros(leaf.shape, jnp.promote_types(leaf.dtype, jnp.float32)), self.encoder_params
         )
         for group, pullback in self.pullbacks.items():
             readers = {name: at[group] for name, at in at_latents.items() if name in coefficients and group in at}
             if readers:
-                (part,) = pullback(like(weighted_sum(readers, coefficients), self.latents[group]))
-                total = jax.tree.map(lambda before, more: before + more.astype(before.dtype), total, part)
+                (term,) = pullback(cast_like(weighted_sum(readers, coefficients), self.latents[group]))
+                total = jax.tree.map(lambda before, more: before + more.astype(before.dtype), total, term)
         return total
 
     def dots(self, direction: Params, at_latents: AtLatents) -> dict[str, jax.Array]:
-        """Compute the inner products of the losses' gradients with a direction in the shared parameters, [] float32 by name."""
-        along, read = like(direction, self.encoder_params), {group for at in at_latents.values() for group in at}
+        """Compute the inner products of the losses' gradients with a direction in the shared parameters, [] float32 by name.
+
+        Args:
+            direction: Tree like the shared parameters.
+            at_latents: Gradients of the losses with respect to the latents.
+        """
+        along, read = cast_like(direction, self.encoder_params), {group for at in at_latents.values() for group in at}
         tangents = {
             group: jax.jvp(encode, (self.encoder_params,), (along,))[1]
             for group, encode in self.functions.items()
@@ -100,7 +110,7 @@ class Through:
         return 0.5 * (matrix + matrix.T)
 
 
-def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], encoder_params: Params, *args: Any) -> Through:
+def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], encoder_params: Params, *args: Any) -> Encoding:
     """Compute latents and their pullbacks to the shared parameters.
 
     Args:
@@ -115,11 +125,11 @@ def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], enc
     }
     passes = {group: jax.vjp(function, encoder_params) for group, function in of_picked.items()}
     latents = {group: values for group, (values, _) in passes.items()}
-    return Through(latents, {group: back for group, (_, back) in passes.items()}, of_picked, encoder_params, has_names)
+    return Encoding(latents, {group: back for group, (_, back) in passes.items()}, of_picked, encoder_params, has_names)
 
 
 @dataclasses.dataclass(frozen=True)
-class Differentiated:
+class LossDerivatives:
     """Losses, and the gradient of each with respect to its inputs.
 
     Attributes:
@@ -138,23 +148,23 @@ class Differentiated:
         """Sum the weighted gradients with respect to the parameters, except for the paths through latents: float32."""
         leaves, structure = jax.tree.flatten(params)
 
-        def total(place: int, leaf: jax.Array) -> jax.Array:
+        def total(index: int, leaf: jax.Array) -> jax.Array:
             zeros = jnp.zeros(leaf.shape, jnp.promote_types(leaf.dtype, jnp.float32))
-            gradients = {name: of[place] for name, of in self.of_params.items() if place in of}
+            gradients = {name: of[index] for name, of in self.of_params.items() if index in of}
             return sum((coefficients[name] * gradient.astype(zeros.dtype) for name, gradient in gradients.items()), zeros)
 
-        return jax.tree.unflatten(structure, [total(place, leaf) for place, leaf in enumerate(leaves)])
+        return jax.tree.unflatten(structure, [total(index, leaf) for index, leaf in enumerate(leaves)])
 
 
 def differentiate(
-    losses_fn: Callable[..., Any], has_aux: bool, through: Through, traced: tuple[Any, Any], params: Params, *args: Any
-) -> Differentiated:
+    losses_fn: Callable[..., Any], has_aux: bool, encoding: Encoding, traced: tuple[Any, Any], params: Params, *args: Any
+) -> LossDerivatives:
     """Compute each loss, and its gradients with respect to the parameters and latents that it reads.
 
     Args:
         losses_fn: (params, latents, *args) -> [] floats by name; with ``has_aux``, followed by any auxiliary output.
         has_aux: See ``losses_fn``.
-        through: Result of `encode`.
+        encoding: Result of `encode`.
         traced: Result of `jax.make_jaxpr` for ``losses_fn``, with the shapes that it returns.
         params: All parameters.
         args: Further arguments of ``losses_fn``.
@@ -162,25 +172,25 @@ def differentiate(
     leaves, structure = jax.tree.flatten(params)
     program, results = traced
     losses, of_params, at_latents, extra = {}, {}, {}, None
-    reads = _find_reads(program, split_result(results, has_aux)[0], len(leaves), through)
-    for name, (places, groups) in reads.items():
+    reads = _find_reads(program, split_result(results, has_aux)[0], len(leaves), encoding)
+    for name, (indices, groups) in reads.items():
 
-        def one(chosen: dict[int, jax.Array], latents: dict[str, Any], name: str = name) -> tuple[jax.Array, Any]:
-            now = [chosen.get(place, leaf) for place, leaf in enumerate(leaves)]
-            inputs = through.latents | latents
-            read = inputs if through.has_names else inputs[_ALL]
-            by_name, extra = split_result(losses_fn(jax.tree.unflatten(structure, now), read, *args), has_aux)
+        def compute_loss(chosen: dict[int, jax.Array], latents: dict[str, Any], name: str = name) -> tuple[jax.Array, Any]:
+            current = [chosen.get(index, leaf) for index, leaf in enumerate(leaves)]
+            inputs = encoding.latents | latents
+            read = inputs if encoding.has_names else inputs[_ALL]
+            by_name, extra = split_result(losses_fn(jax.tree.unflatten(structure, current), read, *args), has_aux)
             return to_float32(jnp.asarray(by_name[name])), extra
 
         # Differentiate each loss separately, so that the compiler can remove the computation of all others as dead code.
-        chosen, read = {place: leaves[place] for place in places}, {group: through.latents[group] for group in groups}
-        losses[name], pullback, aux = jax.vjp(one, chosen, read, has_aux=True)
+        chosen, read = {index: leaves[index] for index in indices}, {group: encoding.latents[group] for group in groups}
+        losses[name], pullback, aux = jax.vjp(compute_loss, chosen, read, has_aux=True)
         of_params[name], at_latents[name] = pullback(jnp.ones_like(losses[name]))
         extra = aux if name == MAIN or MAIN not in reads else extra
-    return Differentiated(losses, of_params, at_latents, extra)
+    return LossDerivatives(losses, of_params, at_latents, extra)
 
 
-def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, through: Through) -> dict[str, Any]:
+def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, encoding: Encoding) -> dict[str, Any]:
     """Find where each loss can have a nonzero gradient: indices of the parameters' leaves, and groups of latents.
 
     Within a nested program, every result is assumed to depend on every argument, so the result may include too many places,
@@ -189,13 +199,13 @@ def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, throug
     variables = program.jaxpr.invars
     of_leaf, rest = variables[:num_leaves], iter(variables[num_leaves:])
     # Leaves of a dictionary come in the order of its sorted keys.
-    of_group = {group: [next(rest) for _ in jax.tree.leaves(through.latents[group])] for group in sorted(through.latents)}
+    of_group = {group: [next(rest) for _ in jax.tree.leaves(encoding.latents[group])] for group in sorted(encoding.latents)}
     reads = {}
     for name, result in zip(sorted(losses), program.jaxpr.outvars):  # followed by the auxiliary outputs
         needed = set() if isinstance(result, Literal) else {result}
         for equation in reversed(program.jaxpr.eqns):
             if equation.primitive.name != "stop_gradient" and needed.intersection(equation.outvars):
                 needed.update(variable for variable in equation.invars if not isinstance(variable, Literal))
-        places = [index for index, variable in enumerate(of_leaf) if variable in needed]
-        reads[name] = places, [group for group, members in of_group.items() if needed.intersection(members)]
+        indices = [index for index, variable in enumerate(of_leaf) if variable in needed]
+        reads[name] = indices, [group for group, members in of_group.items() if needed.intersection(members)]
     return reads

@@ -20,7 +20,7 @@ from jaxrl_vis.weighting.base import (
     by_name,
     loss_order,
     next_state,
-    start_alike,
+    start_equal,
     to_vector,
 )
 from jaxrl_vis.weighting.gramian_based import Options, of_gramian
@@ -44,7 +44,7 @@ def gradnorm(alpha: float = 1.5, learning_rate: float = 0.025, heads: Heads = "w
     rule = optax.adam(learning_rate)
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        state = start_alike("gradnorm", names)
+        state = start_equal("gradnorm", names)
         weights = {name: jnp.ones_like(weight) for name, weight in state.weights.items()}
         vector = to_vector(weights)
         return state.replace(weights=weights, memory={"first": jnp.zeros_like(vector), "rule": rule.init(vector)})

@@ -24,7 +24,7 @@ def limited(
         minimum: Minimum weight; None if unbounded.
         maximum: Maximum weight; None if unbounded.
         total: Sum to which the bounded weights are scaled, excluding that of a main loss that is always 1; None for no
-            scaling. Weights that sum to 0 are not scaled.
+            scaling. Scaled weights may exceed the bounds. Weights that sum to 0 are not scaled.
 
     Raises:
         RequestError: The bounds are invalid; from ``update``: the weighting returns a direction.

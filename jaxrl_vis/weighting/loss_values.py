@@ -21,7 +21,7 @@ from jaxrl_vis.weighting.base import (
     Weights,
     by_name,
     next_state,
-    start_alike,
+    start_equal,
     to_vector,
 )
 
@@ -39,7 +39,7 @@ def uniform() -> Weighting:
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
         return state.weights, *next_state(state, state.weights)
 
-    return Weighting("uniform", _begin("uniform"), update, main=False, reads_losses=False)
+    return Weighting("uniform", _make_init("uniform"), update, main=False, reads_losses=False)
 
 
 def random(seed: int = 0) -> Weighting:
@@ -53,7 +53,7 @@ def random(seed: int = 0) -> Weighting:
     """
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        return start_alike("random", names, key=jax.random.key(seed))
+        return start_equal("random", names, key=jax.random.key(seed))
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
         drawn = jax.random.normal(jax.random.fold_in(state.key, state.updates), (len(losses),))
@@ -77,8 +77,13 @@ def uncertainty(learning_rate: float = 1e-2) -> Weighting:
 
     Args:
         learning_rate: Learning rate of Adam for s. The paper uses the model's own optimiser for s.
+
+    Raises:
+        RequestError: ``learning_rate`` is not positive.
     """
-    return _learned("uncertainty", learning_rate, lambda s, losses: (1.0 - jnp.exp(-s) * losses) / 2, lambda s: jnp.exp(-s) / 2)
+    return _make_learned(
+        "uncertainty", learning_rate, lambda s, losses: (1.0 - jnp.exp(-s) * losses) / 2, lambda s: jnp.exp(-s) / 2
+    )
 
 
 def imtl_l(learning_rate: float = 1e-2) -> Weighting:
@@ -89,8 +94,11 @@ def imtl_l(learning_rate: float = 1e-2) -> Weighting:
 
     Args:
         learning_rate: Learning rate of Adam for s. The paper uses the model's own optimiser for s.
+
+    Raises:
+        RequestError: ``learning_rate`` is not positive.
     """
-    return _learned("imtl_l", learning_rate, lambda s, losses: jnp.exp(s) * losses - 1.0, jnp.exp)
+    return _make_learned("imtl_l", learning_rate, lambda s, losses: jnp.exp(s) * losses - 1.0, jnp.exp)
 
 
 def geometric_mean(eps: float = 1e-8) -> Weighting:
@@ -110,7 +118,7 @@ def geometric_mean(eps: float = 1e-8) -> Weighting:
         weights = by_name(losses, mean / (len(losses) * values))
         return weights, *next_state(state, weights)
 
-    return Weighting("geometric_mean", _begin("geometric_mean"), update, main=False)
+    return Weighting("geometric_mean", _make_init("geometric_mean"), update, main=False)
 
 
 def stch(mu: float = 0.1, reference: Mapping[str, float] | None = None) -> Weighting:
@@ -124,7 +132,7 @@ def stch(mu: float = 0.1, reference: Mapping[str, float] | None = None) -> Weigh
         reference: z by name, lower bounds of the losses (the ideal point); 0 for missing names, or for all if None.
 
     Raises:
-        RequestError: mu is not positive.
+        RequestError: ``mu`` is not positive.
     """
     _check_positive("stch", "mu", mu)
 
@@ -135,7 +143,7 @@ def stch(mu: float = 0.1, reference: Mapping[str, float] | None = None) -> Weigh
         weights = by_name(losses, jax.nn.softmax((values - jnp.max(values)) / (count * mu)) / count)
         return weights, *next_state(state, weights)
 
-    return Weighting("stch", _begin("stch"), update, main=False)
+    return Weighting("stch", _make_init("stch"), update, main=False)
 
 
 def dwa(temperature: float = 2.0, epoch: int = 100) -> Weighting:
@@ -150,13 +158,13 @@ def dwa(temperature: float = 2.0, epoch: int = 100) -> Weighting:
         epoch: Number of updates in an epoch.
 
     Raises:
-        RequestError: An argument is not positive.
+        RequestError: ``temperature`` or ``epoch`` is not positive.
     """
     _check_positive("dwa", "temperature", temperature)
     _check_positive("dwa", "epoch", epoch)
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        state = start_alike("dwa", names)
+        state = start_equal("dwa", names)
         weights = {name: jnp.ones_like(weight) for name, weight in state.weights.items()}
         zeros = jnp.zeros(len(weights), weights[next(iter(weights))].dtype)
         return state.replace(weights=weights, memory={"sum": zeros, "last": jnp.zeros_like(zeros)})
@@ -191,13 +199,13 @@ def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0
         eps: Constant added to the losses after subtracting ``reference``.
 
     Raises:
-        RequestError: An argument is negative, or eps not positive.
+        RequestError: ``eps`` is not positive.
     """
     _check_positive("famo", "eps", eps)
     rule = optax.chain(optax.add_decayed_weights(decay), optax.adam(learning_rate))
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        state = start_alike("famo", names)
+        state = start_equal("famo", names)
         logits = jnp.zeros(len(state.weights), state.weights[next(iter(state.weights))].dtype)
         return state.replace(memory={"logits": logits, "rule": rule.init(logits), "logs": jnp.zeros_like(logits)})
 
@@ -210,22 +218,22 @@ def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0
         learned = {"logits": optax.apply_updates(memory["logits"], changes), "rule": rule_state}
         previous = {name: memory[name] for name in learned}
         # There are no losses before the first ones.
-        now = jax.tree.map(lambda new, old: jnp.where(state.updates > 0, new, old), learned, previous)
-        ratios = jax.nn.softmax(now["logits"]) / above
+        current = jax.tree.map(lambda new, old: jnp.where(state.updates > 0, new, old), learned, previous)
+        ratios = jax.nn.softmax(current["logits"]) / above
         weights = by_name(losses, ratios / jnp.sum(ratios))
-        return weights, *next_state(state, weights, memory={**now, "logs": jnp.log(above)})
+        return weights, *next_state(state, weights, memory={**current, "logs": jnp.log(above)})
 
     return Weighting("famo", init, update, main=False)
 
 
-def _begin(label: str) -> Callable[..., WeightingState]:
+def _make_init(label: str) -> Callable[..., WeightingState]:
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        return start_alike(label, names)
+        return start_equal(label, names)
 
     return init
 
 
-def _learned(
+def _make_learned(
     label: str,
     learning_rate: float,
     slope: Callable[[jax.Array, jax.Array], jax.Array],
@@ -243,7 +251,7 @@ def _learned(
     rule = optax.adam(learning_rate)
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        state = start_alike(label, names)
+        state = start_equal(label, names)
         scales = jnp.zeros(len(state.weights), state.weights[next(iter(state.weights))].dtype)
         weights = by_name(state.weights, to_weights(scales))
         return state.replace(weights=weights, memory={"scales": scales, "rule": rule.init(scales)})

@@ -27,10 +27,10 @@ from jaxrl_vis.weighting.base import (
     WeightingState,
     Weights,
     auxiliary_names,
-    checked,
-    report,
-    scaled,
+    check_eps,
+    scale_tree,
     start,
+    weight_metrics,
 )
 
 
@@ -71,10 +71,10 @@ def ol_aux(
         slopes = weighting.slopes(losses)
         dots = {name: slopes[MAIN] * slopes[name] * statistics[name] for name in state.sums}
         sums = jax.tree.map(jnp.add, state.sums, dots)
-        after = move(state, scaled(sums, 1.0 / interval), sums)
-        return state.weights, after, report(state.weights, dots)
+        after = move(state, scale_tree(sums, 1.0 / interval), sums)
+        return state.weights, after, weight_metrics(state.weights, dots)
 
-    weighting = checked(
+    weighting = check_eps(
         Weighting("ol_aux", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps, heads=heads, interval=interval)
     )
     return weighting
@@ -94,7 +94,7 @@ def make_rule(
     Args:
         label: Name of the weighting, for error messages.
         interval, learning_rate, beta, minimum, maximum: See `ol_aux`.
-        multiplicative: Compare w_i g_i instead of g_i, as in the authors' quadratic example.
+        multiplicative: Whether to compare w_i g_i instead of g_i, as in the authors' quadratic example.
 
     Returns:
         Function of the state, mean dot products ([] float32 by name), sums of this interval and values of other fields, which
@@ -110,7 +110,7 @@ def make_rule(
     if maximum is not None and not maximum >= max(minimum or 0.0, 0.0):
         raise RequestError(f"maximum of weighting {label} must be at least its minimum, not {maximum}")
 
-    def move(state: WeightingState, mean: dict[str, jax.Array], sums: Any, **more: Any) -> WeightingState:
+    def move(state: WeightingState, mean: dict[str, jax.Array], sums: Any, **fields: Any) -> WeightingState:
         due = (state.updates + 1) % interval == 0
         weights = {MAIN: state.weights[MAIN]}
         for name, value in mean.items():
@@ -118,7 +118,7 @@ def make_rule(
             moved = old + step_size * (old * value if multiplicative else value)
             weights[name] = jnp.where(due, jnp.clip(moved, minimum, maximum), old)
         sums = jax.tree.map(lambda leaf: jnp.where(due, 0.0, leaf), sums)
-        after = WeightingState(weights=weights, updates=state.updates + 1, sums=sums, **more)
+        after = WeightingState(weights=weights, updates=state.updates + 1, sums=sums, **fields)
         return jax.tree.map(lambda new, old: new.astype(old.dtype), after, state)  # the carry of a scan must keep its dtypes
 
     return move

@@ -20,11 +20,11 @@ from jaxrl_vis.weighting.base import (
     WeightingState,
     Weights,
     auxiliary_names,
-    checked,
+    check_eps,
     dot,
-    report,
-    scaled,
+    scale_tree,
     start,
+    weight_metrics,
     weighted_sum,
     zeros_for,
 )
@@ -54,7 +54,7 @@ def ol_aux_window(
         main_grad: main for the gradient of the main loss (thesis), or total for that of the whole weighted objective, which
             adds w_i |g_i|^2 to each dot product (release).
         window: Number of latest updates over which gradients are averaged; 4 in the release, 1 in the thesis.
-        multiplicative: Compare w_i g_i instead of g_i, as in the authors' quadratic example.
+        multiplicative: Whether to compare w_i g_i instead of g_i, as in the authors' quadratic example.
 
     Raises:
         RequestError: An argument is invalid; from ``init``: ``shared`` is not given; from ``update``: the state belongs to
@@ -72,17 +72,17 @@ def ol_aux_window(
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
         check_state(label, state)
-        latest = _learned(weighting, losses, statistics)
+        latest = _log_gradients(weighting, losses, statistics)
         latest[MAIN] = _direction(main_grad, latest, state.weights)
         gradients = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, latest)
         count = jnp.minimum(state.updates + 1, window)  # the window begins with zeros
         mean = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0) / count, gradients)
         dots = {name: dot(mean[MAIN], mean[name]) for name in state.sums}
         sums = jax.tree.map(jnp.add, state.sums, dots)
-        after = move(state, scaled(sums, 1.0 / interval), sums, window=gradients)
-        return state.weights, after, report(state.weights, dots)
+        after = move(state, scale_tree(sums, 1.0 / interval), sums, window=gradients)
+        return state.weights, after, weight_metrics(state.weights, dots)
 
-    weighting = checked(
+    weighting = check_eps(
         Weighting(label, init, update, needs="gradients", log=log, eps=eps, main_eps=main_eps, heads=heads, interval=interval)
     )
     return weighting
@@ -112,7 +112,8 @@ def ol_aux_ablation(
         window: Must be 1; gradients are already averaged over the interval.
 
     Raises:
-        RequestError: An argument is invalid; from ``init``: ``shared`` or ``params`` is not given.
+        RequestError: An argument is invalid; from ``init``: ``shared`` or ``params`` is not given; from ``update``: the state
+            belongs to another weighting.
     """
     label = "ol_aux_ablation"
     check_count(label, "window", window)
@@ -127,8 +128,8 @@ def ol_aux_ablation(
             raise RequestError(f"weighting {label} keeps parameters: give init all of them, too")
         sums = {name: jnp.zeros(()) for name in (MAIN, *others)}
         sums = {"losses": sums, "gradients": zeros_for(label, (MAIN, *others), shared)}
-        held = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), params)
-        return start(others, dict.fromkeys(others, 1.0), sums=sums, params=held)
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), params)
+        return start(others, dict.fromkeys(others, 1.0), sums=sums, params=zeros)
 
     def hold(params: Params, state: WeightingState) -> WeightingState:
         is_new = state.updates % interval == 0
@@ -140,13 +141,13 @@ def ol_aux_ablation(
         check_state(label, state)
         sums = jax.tree.map(jnp.add, state.sums, {"losses": dict(losses), "gradients": dict(statistics)})
         # Means, as those of one large minibatch.
-        mean = scaled(sums, 1.0 / (state.updates % interval + 1))
-        gradients = _learned(weighting, mean["losses"], mean["gradients"])
+        mean = scale_tree(sums, 1.0 / (state.updates % interval + 1))
+        gradients = _log_gradients(weighting, mean["losses"], mean["gradients"])
         direction = _direction(main_grad, gradients, state.weights)
         dots = {name: dot(direction, gradient) for name, gradient in gradients.items() if name != MAIN}
-        return state.weights, move(state, dots, sums, params=state.params), report(state.weights, dots)
+        return state.weights, move(state, dots, sums, params=state.params), weight_metrics(state.weights, dots)
 
-    weighting = checked(
+    weighting = check_eps(
         Weighting(label, init, update, needs="gradients", log=log, eps=eps, main_eps=main_eps, interval=interval, hold=hold)
     )
     return weighting
@@ -159,11 +160,11 @@ def _check_main_grad(label: str, main_grad: str) -> None:
         )
 
 
-def _learned(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params]) -> dict[str, Params]:
-    """Convert gradients of the losses to those of the learned objective."""
-    return {name: scaled(gradients[name], slope) for name, slope in weighting.slopes(losses).items()}
+def _log_gradients(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params]) -> dict[str, Params]:
+    """Convert gradients of the losses to those of their logarithms, if the weighting minimises these."""
+    return {name: scale_tree(gradients[name], slope) for name, slope in weighting.slopes(losses).items()}
 
 
 def _direction(main_grad: MainGradient, gradients: Mapping[str, Params], weights: Weights) -> Params:
-    """Return the gradient that the others are compared with."""
+    """Return the gradient with which those of auxiliary losses are compared: the main loss's, or the weighted sum of all."""
     return gradients[MAIN] if main_grad == "main" else weighted_sum(gradients, weights)

@@ -88,6 +88,6 @@ def make_weighting(name: str, **options: Any) -> Weighting:
 
 
 def _parameters(maker: Callable[..., Weighting]) -> tuple[str, ...]:
-    own = inspect.signature(maker).parameters.values()
-    common = Options.__annotations__ if any(one.kind is one.VAR_KEYWORD for one in own) else ()
-    return (*(one.name for one in own if one.kind is not one.VAR_KEYWORD), *common)
+    parameters = inspect.signature(maker).parameters.values()
+    common = Options.__annotations__ if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters) else ()
+    return (*(parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD), *common)

@@ -80,7 +80,7 @@ def nonnegative(
 
 
 def _pivot(matrix: jax.Array, target: jax.Array, free: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Solve the problem of `nonnegative` for a positive definite matrix."""
+    """Solve the problem of `nonnegative` for a positive definite matrix; arguments and results as there."""
     count, eps = len(target), jnp.finfo(matrix.dtype).eps
 
     def solve(free: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -236,9 +236,9 @@ def bargain(gramian: jax.Array, preferences: jax.Array, exponent: float = 1.0) -
     greatest = jnp.sqrt(jnp.maximum(jnp.max(jnp.diagonal(gramian)), 0.0))
     lengths = relative * jnp.where(greatest > 0.0, greatest, 1.0)
     # With a = x scale / lengths, the equation is unit x = ratios x^(-power), where the maximum of ratios is 1.
-    wanted = preferences * lengths ** (power - 1.0)
-    scale = jnp.max(wanted) ** (1.0 / (1.0 + power))
-    ratios = wanted / jnp.max(wanted)
+    targets = preferences * lengths ** (power - 1.0)
+    scale = jnp.max(targets) ** (1.0 / (1.0 + power))
+    ratios = targets / jnp.max(targets)
 
     def objective(x: jax.Array) -> jax.Array:
         utility = jnp.log(x) if power == 1.0 else x ** (1.0 - power) / (1.0 - power)
@@ -275,7 +275,7 @@ def to_simplex(vector: jax.Array) -> jax.Array:
 
 
 def quadratic(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """Compute the scalar x^T M x at full matrix-multiplication precision."""
+    """Compute x^T M x, [], of a matrix [K, K] and a vector [K] at full matrix-multiplication precision."""
     precision: Any = jax.lax.Precision.HIGHEST
     return jnp.dot(vector, jnp.dot(matrix, vector, precision=precision), precision=precision)
 

@@ -89,18 +89,18 @@ def gradvac_weights(
         others = orders[:, index]
         dots = jnp.matmul(changed, gramian, precision=jax.lax.Precision.HIGHEST)
         length = jnp.sqrt(jnp.maximum(jnp.sum(dots * changed, axis=1), 0.0))
-        other = lengths[others]
+        other_lengths = lengths[others]
         # A modified gradient that almost vanishes is rounding error, without a meaningful direction.
         is_some = length > 4.0 * jnp.finfo(gramian.dtype).eps ** 0.5 * lengths
-        is_pair = (others != rows) & is_some & (other > 0.0)
-        safe = jnp.where(is_pair, other, 1.0)
+        is_pair = (others != rows) & is_some & (other_lengths > 0.0)
+        safe = jnp.where(is_pair, other_lengths, 1.0)
         cosine = jnp.clip(jnp.where(is_pair, dots[rows, others] / (jnp.where(is_pair, length, 1.0) * safe), 0.0), -1.0, 1.0)
-        wanted = target_cosines[rows, others]
-        sine, wanted_sine = jnp.sqrt(1.0 - cosine**2), jnp.sqrt(1.0 - jnp.minimum(wanted**2, 1.0))
-        gains = is_pair & (cosine < wanted) & (wanted_sine > 0.0)
-        gain = length * (wanted * sine - cosine * wanted_sine) / (safe * jnp.where(gains, wanted_sine, 1.0))
+        target_cosine = target_cosines[rows, others]
+        sine, target_sine = jnp.sqrt(1.0 - cosine**2), jnp.sqrt(1.0 - jnp.minimum(target_cosine**2, 1.0))
+        gains = is_pair & (cosine < target_cosine) & (target_sine > 0.0)
+        gain = length * (target_cosine * sine - cosine * target_sine) / (safe * jnp.where(gains, target_sine, 1.0))
         changed = changed.at[rows, others].add(jnp.where(gains, gain, 0.0))
-        target_cosines = target_cosines.at[rows, others].add(jnp.where(others != rows, beta * (cosine - wanted), 0.0))
+        target_cosines = target_cosines.at[rows, others].add(jnp.where(others != rows, beta * (cosine - target_cosine), 0.0))
     return jnp.sum(changed, axis=0), target_cosines
 
 

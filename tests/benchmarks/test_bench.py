@@ -111,13 +111,13 @@ def test_what_a_machine_is_calibrated_with_is_computed_when_it_is_measured() -> 
 
 
 def test_the_machine_is_watched() -> None:
-    watch = conditions.Watch()
-    found = watch.conditions()
-    assert conditions.machine() == found["machine"] and len(found["machine"]) == 12
+    monitor = conditions.ConditionMonitor()
+    found = monitor.conditions()
+    assert conditions.machine_id() == found["machine"] and len(found["machine"]) == 12
     assert found["busy_cores"] is None or 0.0 <= found["busy_cores"] <= 2 * found["cores"]
     for each in found["calibration"].values():
         assert set(each) == {"gflops", "gbytes_per_s"} and all(value > 0.0 for value in each.values())
-    assert found["calibration"]["after"] == watch.conditions()["calibration"]["before"]
+    assert found["calibration"]["after"] == monitor.conditions()["calibration"]["before"]
 
 
 def test_a_user_s_records_go_into_the_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

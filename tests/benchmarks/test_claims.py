@@ -37,12 +37,12 @@ def test_cells_say_what_can_be_counted_by_hand():
     assert columns.steps_to(0.5).cell(slow) == "30"
     assert columns.steps_to(0.5, slow).cell(fast) == "10 (3.0)"
     assert columns.steps_to(0.9, slow).cell(slow) == "> 60"
-    assert columns.at(10).cell(fast) == "0.52"
-    assert columns.at(15).cell(fast) == ""
+    assert columns.median_at(10).cell(fast) == "0.52"
+    assert columns.median_at(15).cell(fast) == ""
     assert columns.success_at(10).cell(fast) == "0.520 (0.510 to 0.530)"
     assert columns.mean_success(20).cell(slow) == "0.050 (0.050 to 0.050)"
     # Of 252 ways to divide ten seeds into fives, two are as extreme.
-    assert columns.p(slow, "slow", 60).cell(fast) == f"{2 / 252:.3f}"
+    assert columns.p_value_against(slow, "slow", 60).cell(fast) == f"{2 / 252:.3f}"
     assert columns.verdict(fast, slow, 60) == "better" and columns.verdict(slow, fast, 60) == "worse"
     assert columns.verdict(fast, record("again", *[[0.5 + seed / 100, 0.5] for seed in range(5)]), 20) == "level"
     with pytest.raises(ValueError, match="ends at 60"):
@@ -50,7 +50,7 @@ def test_cells_say_what_can_be_counted_by_hand():
 
 
 def test_a_row_without_a_record_says_so():
-    text = table(["run"], [Row("kept", record("kept", [0.25])), Row("lost", None)], [columns.at(10), columns.names()])
+    text = table(["run"], [Row("kept", record("kept", [0.25])), Row("lost", None)], [columns.median_at(10), columns.names()])
     assert text.splitlines()[2:4] == ["| kept | 0.25 | `` |", "| lost | no record kept | |"]
     assert text.endswith("Made by abc on a GPU.")
 

@@ -33,7 +33,7 @@ class Picture:
     def __init__(self, env):
         self.env = env
 
-    def image(self):
+    def render(self):
         return np.full(host_fetch.SHAPE, np.clip(100 + 400 * self.env.grip[0], 0, 255), np.uint8)
 
     def close(self):
@@ -53,22 +53,22 @@ def towards(image, goal, displacement):
 @pytest.mark.usefixtures("hosted")
 def test_an_episode_holds_what_was_seen_done_and_true():
     robot = host_fetch.HostFetch(noise=2.0, seed=0)
-    played = robot.episode(towards)
+    played = robot.run_episode(towards)
     assert played.is_reached and played.observations.shape == (51, 32, 32, 1) and played.observations.dtype == np.uint8
     assert played.actions.shape == (50, 4) and np.abs(played.actions).max() == 1.0
     np.testing.assert_allclose(played.states[1:-1], np.cumsum(0.05 * played.actions[:, :3], axis=0), atol=1e-5)
     assert np.std(played.observations[0] - 100.0) == pytest.approx(2.0, abs=0.2)
     # The goal image shows the goal, where the last state is.
     assert played.goal.mean() == pytest.approx(100 + 400 * played.states[-1, 0], abs=1.0)
-    assert not robot.episode(lambda image, goal, displacement: -towards(image, goal, displacement)).is_reached
+    assert not robot.run_episode(lambda image, goal, displacement: -towards(image, goal, displacement)).is_reached
 
 
 @pytest.mark.usefixtures("hosted")
 def test_a_seed_repeats_goals_and_noise():
     robot = host_fetch.HostFetch(noise=5.0, seed=3)
-    first, second = robot.episode(towards), robot.episode(towards)
+    first, second = robot.run_episode(towards), robot.run_episode(towards)
     robot.reseed(3)
-    np.testing.assert_array_equal(robot.episode(towards).observations, first.observations)
+    np.testing.assert_array_equal(robot.run_episode(towards).observations, first.observations)
     assert (first.states[-1] != second.states[-1]).all()
 
 

@@ -27,7 +27,7 @@ def shell(tmp_path):
     ],
 )
 def test_what_is_as_expected_is_no_failure(shell, words, expectations, capsys):
-    shell.type(words, **expectations)
+    shell.run(words, **expectations)
     assert not shell.failures
     assert ": as expected" in capsys.readouterr().out
 
@@ -43,7 +43,7 @@ def test_what_is_as_expected_is_no_failure(shell, words, expectations, capsys):
     ],
 )
 def test_what_is_not_as_expected_is_a_failure(shell, words, expectations, problem, capsys):
-    shell.type(words, **expectations)
+    shell.run(words, **expectations)
     (failure,) = shell.failures
     assert words in failure and problem in failure
     assert "NOT AS EXPECTED" in capsys.readouterr().out

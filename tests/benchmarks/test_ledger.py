@@ -13,7 +13,7 @@ from test_provenance import commit
 from benchmarks.ledger import __main__ as ledger
 from benchmarks.ledger import ablations, evidence, pages, records, staleness
 from benchmarks.ledger.tables import lab_results as tables
-from benchmarks.ledger.tables.comparison import comparison_table
+from benchmarks.ledger.tables.comparison import RATES, comparison_table
 from benchmarks.ledger.tables.lab_rows import DEVICES, LEARNING, Figure, Learning
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
@@ -222,7 +222,7 @@ def test_a_figure_takes_the_best_record_or_the_hardest() -> None:
     ],
 )
 def test_figures_have_three_digits(value: float, text: str) -> None:
-    assert tables.short(value) == text
+    assert tables.format_short(value) == text
 
 
 def test_the_comparison_takes_the_variant_that_is_hardest_for_us(tmp_path: Path) -> None:
@@ -243,7 +243,7 @@ def test_the_comparison_takes_the_variant_that_is_hardest_for_us(tmp_path: Path)
         ]
     (tmp_path / "render.json").write_text(json.dumps(stored))
     rows = comparison_table(tmp_path).splitlines()[2:]
-    assert len(rows) == 5
+    assert len(rows) == len(RATES) + 1
     (row,) = [row for row in rows if tables.MISSING not in row]
     assert row.endswith("| 2.00 k images/s | MuJoCo Warp: 1.00 k images/s | 2 times |")
 
@@ -298,9 +298,9 @@ def test_a_run_is_kept_small(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 def test_a_run_without_evaluations_is_not_kept(tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="no evaluation"):
-        evidence.keep(make_run(tmp_path / "run", []), "discs", tmp_path)
+        evidence.keep_run(make_run(tmp_path / "run", []), "discs", tmp_path)
     with pytest.raises(RequestError, match="no config.json"):
-        evidence.keep(tmp_path / "none", "discs", tmp_path)
+        evidence.keep_run(tmp_path / "none", "discs", tmp_path)
 
 
 def test_a_value_is_reached_when_the_next_two_evaluations_confirm_it() -> None:
@@ -321,7 +321,7 @@ def test_curves_are_medians_over_all_seeds() -> None:
 
 def test_a_row_says_what_its_runs_reached(tmp_path: Path) -> None:
     for seed, success in ((0, [0.5, 0.9, 1.0, 1.0]), (1, [0.7, 0.9, 0.96, 0.98])):
-        evidence.keep(make_run(tmp_path / f"run{seed}", rows_of(success, seed), seed=seed), f"discs{seed}", tmp_path)
+        evidence.keep_run(make_run(tmp_path / f"run{seed}", rows_of(success, seed), seed=seed), f"discs{seed}", tmp_path)
     runs = {f"discs{seed}": preset("debug", seed=seed) for seed in (0, 1)}
     row = Learning("discs", runs, targets=(0.9, 0.97), steps=(2500,))
     text = tables.learning_text(row, tables.load_runs(row, tmp_path))
@@ -364,7 +364,7 @@ def test_a_damaged_file_of_records_is_named(tmp_path: Path, capsys: pytest.Captu
     assert ledger.main(["stale", "--results", str(tmp_path)], checkout=tmp_path) == 2
     line = capsys.readouterr().err
     assert "env.json is not JSON" in line and line.count("\n") == 1
-    evidence.keep(make_run(tmp_path / "run", rows_of([0.5])), "discs", tmp_path)
+    evidence.keep_run(make_run(tmp_path / "run", rows_of([0.5])), "discs", tmp_path)
     with (tmp_path / "learning" / "discs.metrics.jsonl").open("a") as file:
         file.write('{"seed": 0, "env_')
     with pytest.raises(RequestError, match="discs.metrics.jsonl has a line that is not JSON"):

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.ledger import pages
 from benchmarks.ledger.markers import fill
 from benchmarks.soak import parts
-from benchmarks.soak.record import GUARANTEES, Record, added
+from benchmarks.soak.record import GUARANTEES, Record, add_records
 from benchmarks.soak.soak import Soak
 
 FAULTS, SEED = 2, 156  # SIGKILL during a save, then SIGTERM
@@ -20,7 +20,7 @@ def test_a_minute_of_faults(tmp_path, monkeypatch):
     options[options.index("--env-steps") + 1] = str(80 * parts.STEPS)  # a third of a soak's runs
     monkeypatch.setattr(parts, "OPTIONS", options)
     soak = Soak(tmp_path, FAULTS, SEED, math.inf, note=lambda record: None, alone=False)
-    soak.undisturbed()
+    soak.train_reference()
     soak.work(0)
     assert not soak.record.broken
     assert soak.record.total == FAULTS and len([count for count in soak.record.faults.values() if count]) == FAULTS
@@ -37,7 +37,7 @@ def record(seed: int, **changes) -> Record:
 def test_pieces_are_added(tmp_path):
     for seed in (1, 2):
         record(seed).write(tmp_path / "soak" / f"{seed}.json")
-    total = added([Record.read(piece) for piece in sorted((tmp_path / "soak").iterdir())])
+    total = add_records([Record.read(piece) for piece in sorted((tmp_path / "soak").iterdir())])
     assert total.faults["SIGKILL"] == 20 and total.total == 2 * (len(GUARANTEES) - 1 + 10) and len(GUARANTEES) >= 15
     assert (total.minutes, total.runs, total.exact, total.resumes, total.replays_lost) == (18.0, 12, 10, 96, 2)
     table = total.table()
@@ -50,9 +50,9 @@ def test_pieces_are_added(tmp_path):
 
 def test_what_cannot_be_added_is_refused():
     with pytest.raises(ValueError, match="different commits"):
-        added([record(1), record(2, machine={"commit": "def"})])
+        add_records([record(1), record(2, machine={"commit": "def"})])
     with pytest.raises(ValueError, match="same piece twice"):
-        added([record(1), record(1)])
+        add_records([record(1), record(1)])
 
 
 def test_a_violated_guarantee_is_in_the_table():

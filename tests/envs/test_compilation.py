@@ -117,7 +117,7 @@ def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypa
 def run_of(function) -> Programs:
     """A run of which ``init`` is a function of keys, and nothing else is there."""
     programs = Programs(
-        preset("debug"), SimpleNamespace(env=None, layout=ONE_DEVICE, part_size=1, plays_any=False, init=jax.jit(function))
+        preset("debug"), SimpleNamespace(env=None, layout=ONE_DEVICE, part_size=1, plays_parts=False, init=jax.jit(function))
     )
     programs.shapes = SimpleNamespace(train=None)  # type: ignore[assignment]
     return programs
@@ -230,7 +230,7 @@ def test_mlir_finds_the_dialect_of_triton(monkeypatch):
     monkeypatch.delitem(sys.modules, name, raising=False)
     with pytest.raises(ImportError):
         importlib.import_module(name)
-    compilation._name_triton_dialect.cache_clear()
+    compilation._register_triton_dialect.cache_clear()
     with tracing_for("cuda"), kernels(True):
         assert use_gpu_kernels()
     assert importlib.import_module(name) is importlib.import_module("jaxlib.triton.dialect")

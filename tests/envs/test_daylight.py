@@ -11,9 +11,9 @@ from jaxrl_vis_envs.plants import SHIFTED, TRAINING
 from jaxrl_vis_envs.plants.field import generator
 from jaxrl_vis_envs.plants.pairs import Sequence, daylight, grass
 from jaxrl_vis_envs.plants.rendering import backdrop
-from jaxrl_vis_envs.plants.rendering.blades import Blades, cover_with_blades
+from jaxrl_vis_envs.plants.rendering.blades import Blades, render_blades
 from jaxrl_vis_envs.plants.rendering.degrading import degrade
-from jaxrl_vis_envs.plants.rendering.surfaces import GROUND, NOTHING, OBJECT, build
+from jaxrl_vis_envs.plants.rendering.surfaces import GROUND, NOTHING, OBJECT, build_surfaces
 from jaxrl_vis_envs.plants.scene import Scene
 from jaxrl_vis_envs.plants.settling import settle
 from jaxrl_vis_envs.plants.truth import stalks_in_view
@@ -53,7 +53,7 @@ def test_families_without_days_are_as_they_were(family, sums):
     plot = plants.draw(family, 3)
     assert plot.family is family and settle(family, generator(family, 3, "scene")) is family
     assert daylight(family, 3) is None
-    surfaces = build(plot)
+    surfaces = build_surfaces(plot)
     found = [float(np.abs(part).sum()) for part in (surfaces.start, surfaces.radii, surfaces.corners, surfaces.materials)]
     np.testing.assert_allclose(found, sums, rtol=1e-5)
 
@@ -91,7 +91,7 @@ def test_equal_seeds_give_equal_days(bare):
 
 def test_things_that_are_no_stalk_are_never_counted():
     plot = plants.draw(by_day(potted=1, indoors=0, robot=1, objects=(4, 4)), 5)
-    surfaces = build(plot)
+    surfaces = build_surfaces(plot)
     assert (surfaces.cone_stalk == OBJECT).sum() > 10
     assert set(surfaces.cone_stalk[surfaces.cone_stalk != OBJECT]) == set(range(len(plot.stalks)))
     assert len(surfaces.materials) == 1 + max(surfaces.cone_material.max(), surfaces.triangle_material.max())
@@ -136,12 +136,12 @@ def test_pixels_under_a_border_show_nothing():
 
 def test_backdrops(monkeypatch):
     rooms = [
-        backdrop.draw_backdrop(np.random.default_rng(seed), indoors, False, 1.0) for seed, indoors in ((0, True), (0, False))
+        backdrop.sample_backdrop(np.random.default_rng(seed), indoors, False, 1.0) for seed, indoors in ((0, True), (0, False))
     ]
     assert all(room.shape == (*backdrop.SHAPE, 3) and np.isfinite(room).all() and room.min() >= 0 for room in rooms)
     monkeypatch.setattr(backdrop, "photograph_files", list)
     with pytest.raises(ValueError, match="pip install scikit-image"):
-        backdrop.draw_backdrop(np.random.default_rng(0), False, True, 1.0)
+        backdrop.sample_backdrop(np.random.default_rng(0), False, True, 1.0)
 
 
 def one_blade() -> Blades:
@@ -155,12 +155,12 @@ def test_a_blade_stands_where_it_projects_in_the_colour_of_its_ground():
     ground = np.full((301, 201), GROUND, np.int32)
     for baseline in (0.0, 0.1):
         camera = (np.array([baseline, 0.0, 0.0]), np.eye(3), 500.0, (100.0, 150.0))
-        changed = cover_with_blades(radiance, ground, depth, one_blade(), camera) != radiance
+        changed = render_blades(radiance, ground, depth, one_blade(), camera) != radiance
         line, column = np.nonzero(changed.any(axis=2))
         assert (line.min(), line.max()) == (200, 250)
         assert np.median(column) == 100 - 500 * baseline / 2
         assert abs(np.ptp(column[line == 250]) - 5) <= 1 and np.ptp(column[line == 205]) <= 2
-    covered = cover_with_blades(radiance, ground, depth, one_blade(), camera)
+    covered = render_blades(radiance, ground, depth, one_blade(), camera)
     np.testing.assert_allclose(covered[240, 75], [0.3, 0.2, 0.1], rtol=1e-5)
 
 
@@ -168,7 +168,7 @@ def test_a_blade_is_hidden_by_what_is_nearer():
     radiance, depth = np.full((301, 201, 3), 0.1, np.float32), np.full((301, 201), 5.0, np.float32)
     depth[:230] = 1.5
     instance = np.where(depth < 2, 7, GROUND).astype(np.int32)
-    covered = cover_with_blades(radiance, instance, depth, one_blade(), (np.zeros(3), np.eye(3), 500.0, (100.0, 150.0)))
+    covered = render_blades(radiance, instance, depth, one_blade(), (np.zeros(3), np.eye(3), 500.0, (100.0, 150.0)))
     line, _ = np.nonzero((covered != radiance).any(axis=2))
     assert (line.min(), line.max()) == (230, 250)
 

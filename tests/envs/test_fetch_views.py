@@ -41,12 +41,12 @@ def test_the_camera_is_mujocos_free_camera_at_their_settings():
     theirs = drawn.camera[0]
     position, forward, up = (np.array(array) for array in (theirs.pos, theirs.forward, theirs.up))
     position = (position + np.array(drawn.camera[1].pos)) / 2.0  # both eyes
-    our_position, rotation, _ = camera_pose(env()._draw.scene, data)
+    our_position, rotation, _ = camera_pose(env()._observer.scene, data)
     np.testing.assert_allclose(our_position, position, atol=1e-6)
     np.testing.assert_allclose(np.asarray(rotation)[:, 2], -forward, atol=1e-6)
     np.testing.assert_allclose(np.asarray(rotation)[:, 1], up, atol=1e-6)
     focal = theirs.frustum_near / theirs.frustum_top * SIZE / 2.0  # in pixels
-    np.testing.assert_allclose(intrinsic_matrix(env()._draw.scene)[1, 1], focal, rtol=1e-6)
+    np.testing.assert_allclose(intrinsic_matrix(env()._observer.scene)[1, 1], focal, rtol=1e-6)
 
 
 def test_goal_images_show_where_ten_proportional_steps_lead():

@@ -76,5 +76,5 @@ def test_a_step_matches_mujoco():
     states = one_step.finger_states(env)
     theirs = one_step.mujoco_step(env.mj_model, states, weld_term=True)
     assert (theirs.contacts > 0).sum() > 30
-    multiples = one_step.in_bounds(one_step.our_step(env, states, "task"), theirs.qvel)
+    multiples = one_step.relative_to_bound(one_step.our_step(env, states, "task"), theirs.qvel)
     assert multiples.max() <= 1.0, f"{np.sort(multiples)[-10:]}"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import cli
-from jaxrl_vis.stalks.phenotyping.measure.stalk import measure
-from jaxrl_vis.stalks.phenotyping.measure.stereo import grey
+from jaxrl_vis.stalks.phenotyping.measure.stalk import measure_stalk
+from jaxrl_vis.stalks.phenotyping.measure.stereo import to_greyscale
 from jaxrl_vis_envs import plants
 from jaxrl_vis_envs.plants import SHIFTED, SHIFTS, TRAINING
 from jaxrl_vis_envs.plants.family import INCH, Family, Layout, Rig, Stalks
@@ -375,7 +375,7 @@ def test_batched_and_sequential_tiles_agree(sequence):
     view = tables.build_view(sequence.surfaces, pose, true)
     numbers = (true.focal, true.centre, (0.0, 0.0), pose.rotation, pose.position, (0.05, -0.1, 0.0), (1.0, 0.01, 0.8))
     shot = shading.Shot(*(jnp.asarray(number, jnp.float32) for number in numbers))
-    one, many = (drawing.draw(view, shot, true.width, true.height, 1, at_once) for at_once in (1, 20))
+    one, many = (drawing.render_view(view, shot, true.width, true.height, 1, at_once) for at_once in (1, 20))
     for left, right in zip(one, many):
         assert np.isclose(np.asarray(left), np.asarray(right), atol=1e-4).mean() > 0.999
 
@@ -392,14 +392,18 @@ def test_a_pair_gives_diameters_in_millimetres(close_up):
     drive, errors = close_up.drive, []
     for frame in (8, 13, 18, 23):
         pair = close_up[frame]
-        instance, left, right = np.asarray(pair.instance), grey(np.asarray(pair.left)), grey(np.asarray(pair.right))
+        instance, left, right = (
+            np.asarray(pair.instance),
+            to_greyscale(np.asarray(pair.left)),
+            to_greyscale(np.asarray(pair.right)),
+        )
         for index, stalk in enumerate(close_up.plot.measured):
             line, column = np.nonzero(instance == index)
             if line.size < 1000 or column.min() < 175 or column.max() > 400:
                 continue  # the right camera does not see it, or neither sees all of it
             corner = (int(line.min()), int(column.min()) - 2)
             mask = instance[corner[0] : line.max() + 1, corner[1] : column.max() + 3] == index
-            found = measure(mask, corner, left, right, drive.true)
+            found = measure_stalk(mask, corner, left, right, drive.true)
             assert not found.reason, found.reason
             lines = outline(stalk, pair.pose, drive.true, np.linspace(0.1, 0.6, 501))[:, :, 1].mean(axis=1)
             height = float(np.linspace(0.1, 0.6, 501)[np.argmin(np.abs(lines - found.line))])

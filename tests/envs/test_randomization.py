@@ -70,7 +70,7 @@ def test_off_adds_nothing() -> None:
             data, goal = self.sample_start(key), self.sample_goal(key)
             state = self.state_at(data, self.achieved(goal))
             both = jax.tree.map(lambda *leaves: jnp.stack(leaves), data, goal)
-            frame, goal_frame = jax.lax.map(lambda data: self._draw(data, None), both)
+            frame, goal_frame = jax.lax.map(lambda data: self._observer(data, None), both)
             return state.replace(obs={"observation": frame, "achieved_goal": frame, "desired_goal": goal_frame})
 
     plain = Plain(env.config)
@@ -265,7 +265,7 @@ def test_every_image_task_takes_every_kind() -> None:
         scene = jax.eval_shape(lambda domain, env=env: randomization.varied_scene(env._scene, domain), domain)
         same = jax.tree.map(lambda one, other: (one.shape, one.dtype) == (other.shape, other.dtype), scene, env._scene)
         assert all(jax.tree.leaves(same))
-        assert isinstance(env._draw, pixels.ImageObserver)
+        assert isinstance(env._observer, pixels.ImageObserver)
 
 
 def test_training_command_randomizes() -> None:

@@ -63,7 +63,7 @@ def test_a_step_matches_mujoco_without_a_weld_term():
     env = make()
     states = one_step.sawyer_states(env)
     less = one_step.mujoco_step(env.mj_model, states, weld_term=False)
-    multiples = one_step.in_bounds(one_step.our_step(env, states, "more"), less.qvel)
+    multiples = one_step.relative_to_bound(one_step.our_step(env, states, "more"), less.qvel)
     assert multiples.max() <= 1.0, f"{np.sort(multiples)[-10:]}"
     # With the task's own iteration, all but a few states with a joint at its limit.
-    assert (one_step.in_bounds(one_step.our_step(env, states, "task"), less.qvel) <= 1.0).mean() > 0.95
+    assert (one_step.relative_to_bound(one_step.our_step(env, states, "task"), less.qvel) <= 1.0).mean() > 0.95

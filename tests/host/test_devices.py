@@ -13,7 +13,7 @@ from fake_program import make_fake_trainer, small_config
 
 from jaxrl_vis import cli
 from jaxrl_vis.host import devices
-from jaxrl_vis.run.compiled.memory import show_bytes
+from jaxrl_vis.run.compiled.memory import format_bytes
 
 _PROGRAM = """
 import contextlib, io, json, sys
@@ -96,11 +96,11 @@ def test_the_guess_follows_what_is_asked_for_installed_and_there(
 def test_a_gpu_without_its_packages_is_mended_by_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(devices, "_is_installed", lambda _: False)
     monkeypatch.setattr(devices, "_exists", lambda _: True)
-    assert devices._mend("cuda") == "; install this project with the extra cuda12 or cuda13"
+    assert devices._hint("cuda") == "; install this project with the extra cuda12 or cuda13"
 
 
 def test_sizes_are_all_in_one_unit() -> None:
-    sizes = [show_bytes(count) for count in (0, 1000, 5 * 2**20, 2**27, 3 * 2**30, 2**45)]
+    sizes = [format_bytes(count) for count in (0, 1000, 5 * 2**20, 2**27, 3 * 2**30, 2**45)]
     assert sizes == ["under 0.001 GiB", "under 0.001 GiB", "0.005 GiB", "0.1 GiB", "3.0 GiB", "32768.0 GiB"]
 
 

@@ -119,4 +119,4 @@ def test_names_are_those_of_the_registries() -> None:
     ):
         assert fields.choices(hints[field]) == tuple(known)
     own = Config().replace(method="a:b", aux_tasks=("egomotion", "c:d"))
-    assert plugins.own_names(own) == {"method": "a:b", "aux_tasks 2": "c:d"}
+    assert plugins.custom_names(own) == {"method": "a:b", "aux_tasks 2": "c:d"}

@@ -18,7 +18,7 @@ from fake_program import interrupted_at, make_fake_trainer, rows_without_time, s
 from jaxrl_vis import cli
 from jaxrl_vis.errors import StorageError
 from jaxrl_vis.host.streams import SafeStream, safe, safe_streams
-from jaxrl_vis.run.loggers.bar import clock
+from jaxrl_vis.run.loggers.bar import format_clock
 from jaxrl_vis.run.loggers.console import RunConsole
 from jaxrl_vis.run.storage import metrics
 from jaxrl_vis.stalks.cli.progress import progress
@@ -136,7 +136,7 @@ def test_a_bar_shows_what_matters_at_any_width(width, monkeypatch):
         with RunConsole() as console:
             console.start(total=120_000, done=40)
             console.advance(1234, 98_765.0)
-            console.evaluated([0.93], [0.0123], "m")
+            console.show_evaluation([0.93], [0.0123], "m")
 
     def measure():
         with progress("pairs") as done:
@@ -151,7 +151,7 @@ def test_a_bar_shows_what_matters_at_any_width(width, monkeypatch):
 
 
 def test_a_clock_is_not_ambiguous():
-    assert [clock(seconds) for seconds in (None, 0, 65, 3725.9, 100_000)] == [
+    assert [format_clock(seconds) for seconds in (None, 0, 65, 3725.9, 100_000)] == [
         "-:--:--",
         "0:00:00",
         "0:01:05",

@@ -12,7 +12,7 @@ import pytest
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner import train_step
 from jaxrl_vis.learner.acting.rollout import Exploration
-from jaxrl_vis.learner.acting.rollout_parts import PART_SIZE, RolloutPart, join_parts, part_size, played_spec
+from jaxrl_vis.learner.acting.rollout_parts import PART_SIZE, RolloutPart, join_parts, part_result_spec, part_size
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.parallel.shards import ONE
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
@@ -64,7 +64,7 @@ def test_parts_are_few_small_and_nearly_full(num_envs: int) -> None:
 
 def test_an_evaluation_is_of_the_same_episodes(programs: Programs, whole: Programs) -> None:
     train = programs.init(programs.run_keys).train
-    assert set(programs.of_evaluation()) == {"play"} and set(whole.of_evaluation()) == {"evaluate"}
+    assert set(programs.evaluation_programs()) == {"play"} and set(whole.evaluation_programs()) == {"evaluate"}
     assert_near(programs.evaluate(train), whole.evaluate(train))
     other, _ = programs.evaluate(train, jax.random.key(5))
     assert not np.array_equal(other["eval/goal_distance"], programs.evaluate(train)[0]["eval/goal_distance"])
@@ -99,11 +99,11 @@ def test_rollouts_are_the_same_and_explore(program: TrainStep, programs: Program
 
 def test_a_gpu_plays_all_at_once(program: TrainStep, programs: Programs, whole: Programs) -> None:
     """And evaluates with a program of its own."""
-    assert (program.part_size, program.plays_any) == (5, True)
+    assert (program.part_size, program.plays_parts) == (5, True)
     assert set(programs.names) == {"play", "learn", "init", "nonfinite_leaves", "keys"}
-    assert (whole.program.part_size, whole.program.plays_any) == (CONFIG.run.num_envs, False)
+    assert (whole.program.part_size, whole.program.plays_parts) == (CONFIG.run.num_envs, False)
     assert set(whole.names) == {"play", "learn", "evaluate", "init", "nonfinite_leaves", "keys"}
-    assert set(programs.of_training()) == set(whole.of_training()) == {"play", "learn", "keys"}
+    assert set(programs.training_programs()) == set(whole.training_programs()) == {"play", "learn", "keys"}
 
 
 def test_parts_are_of_what_all_draw_but_for_the_noise_of_images() -> None:
@@ -124,7 +124,7 @@ def test_what_is_played_has_the_shapes_that_are_compiled_for(program: TrainStep,
     played = program.play(
         programs.init(programs.run_keys).train, programs.run_keys, np.int32(0), Exploration(np.float32(0), np.float32(0))
     )
-    spec = played_spec(program.env, program.part_size, 2)
+    spec = part_result_spec(program.env, program.part_size, 2)
     assert jax.tree.structure(spec) == jax.tree.structure(played)
     assert [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(spec)] == [
         (leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(played)

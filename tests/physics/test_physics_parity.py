@@ -66,7 +66,7 @@ def test_a_step_of_the_push():
     states = one_step.push_states(env)
     theirs = one_step.mujoco_step(env.mj_model, states, weld_term=False)
     assert (theirs.contacts >= 8).sum() > 30
-    multiples = one_step.in_bounds(one_step.our_step(env, states, "task"), theirs.qvel)
+    multiples = one_step.relative_to_bound(one_step.our_step(env, states, "task"), theirs.qvel)
     assert np.median(multiples) < 0.1 and (multiples <= 1.0).mean() > 0.85
 
 
@@ -99,12 +99,12 @@ def test_a_step_of_the_fetch_robot():
     assert (less.contacts == 0).sum() > 100
     assert (less.contacts == 2).sum() > 30
     converged = one_step.our_step(env, states, "more")
-    multiples = one_step.in_bounds(converged, less.qvel)
+    multiples = one_step.relative_to_bound(converged, less.qvel)
     assert multiples.max() <= 1.0, f"{np.sort(multiples)[-10:]}"
     # With the task's own four iterations, all but a few of the states in contact.
-    assert (one_step.in_bounds(one_step.our_step(env, states, "task"), less.qvel) <= 1.0).mean() > 0.97
+    assert (one_step.relative_to_bound(one_step.our_step(env, states, "task"), less.qvel) <= 1.0).mean() > 0.97
     # The term itself, as docs/tasks.md has it: some 1 % of the greatest velocity, and at most 5 %.
-    as_it_is = one_step.in_bounds(converged, one_step.mujoco_step(env.mj_model, states, weld_term=True).qvel)
+    as_it_is = one_step.relative_to_bound(converged, one_step.mujoco_step(env.mj_model, states, weld_term=True).qvel)
     assert 10 < np.median(as_it_is) < 130 and as_it_is.max() < 520
 
 
@@ -113,7 +113,7 @@ def test_a_step_of_the_reacher_is_that_of_mujoco():
     states = one_step.reacher_states(env)
     assert (np.abs(states.qpos[:, 1]) > 3.0).sum() > 30
     theirs = one_step.mujoco_step(env.mj_model, states, weld_term=True)
-    multiples = one_step.in_bounds(one_step.our_step(env, states, "task"), theirs.qvel)
+    multiples = one_step.relative_to_bound(one_step.our_step(env, states, "task"), theirs.qvel)
     assert multiples.max() <= 1.0, f"{np.sort(multiples)[-10:]}"
 
 

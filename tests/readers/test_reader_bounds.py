@@ -280,15 +280,15 @@ def test_boxes_around_runs_need_no_mask(height, width, data):
     if mask.any():
         line, column = np.nonzero(mask)
         expected = [column.min(), line.min(), np.ptp(column) + 1, np.ptp(line) + 1]
-        assert masks.box_around_runs(masks.covering(runs["counts"], height, width), height) == expected
+        assert masks.box_around_runs(masks.check_runs(runs["counts"], height, width), height) == expected
 
 
 def test_outlines_of_many_corners_are_filled_part_by_part(monkeypatch):
     angle = np.linspace(0.0, 6.28, 1000)
     corners = np.stack([32 + 20 * np.cos(angle), 24 + 15 * np.sin(7 * angle)], axis=1).ravel().tolist()
-    whole = masks.outlined_mask([corners], (48, 64))
+    whole = masks.rasterise_polygons([corners], (48, 64))
     monkeypatch.setattr(masks, "_CHUNK_SIZE", 500)
-    assert whole.any() and (masks.outlined_mask([corners], (48, 64)) == whole).all()
+    assert whole.any() and (masks.rasterise_polygons([corners], (48, 64)) == whole).all()
 
 
 # --- weights ---

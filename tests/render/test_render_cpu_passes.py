@@ -10,7 +10,7 @@ from small_scene import MORE_SPHERES, ORTHOGRAPHIC, small_scene
 
 import jaxrl_vis_envs
 from jaxrl_vis_envs.render import camera, render_planes
-from jaxrl_vis_envs.render.cpu import passes, tiles
+from jaxrl_vis_envs.render.cpu import packing, passes, tiles
 from jaxrl_vis_envs.render.outputs import Outputs
 from jaxrl_vis_envs.render.pixel import arithmetic
 from jaxrl_vis_envs.render.pixel.prepare import prepare
@@ -106,7 +106,7 @@ def test_the_passes_have_the_gradients_of_the_plain_renderer(plainly):
 
 def test_packed_normals_round_trip():
     directions = jax.random.normal(jax.random.key(0), (3, 1000)) * jnp.array([[1e-3], [1.0], [30.0]])
-    found = jnp.stack(passes._unpack_normal(passes._pack_normal(tuple(directions))))
+    found = jnp.stack(packing.unpack_normal(packing.pack_normal(tuple(directions))))
     np.testing.assert_allclose(found, directions / jnp.linalg.norm(directions, axis=0), atol=1e-4)
 
 

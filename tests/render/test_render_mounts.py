@@ -137,11 +137,11 @@ def test_documented_task_renders_goals_from_the_hand_camera(page):
     task = documented_task(page)
     env = task(typing.get_type_hints(task.__init__)["config"](image_size=24, pixels="depth", depth_range=(0.1, 2.0)))
     goals = jaxrl_vis_envs.jit(jax.vmap(env.sample_goal))(jax.random.split(jax.random.key(0), 3))
-    images = jaxrl_vis_envs.jit(jax.vmap(env._draw))(goals)
+    images = jaxrl_vis_envs.jit(jax.vmap(env._observer))(goals)
     data = mujoco.MjData(env.mj_model)
     for image, qpos in zip(np.asarray(images), np.asarray(goals.qpos), strict=True):
         data.qpos[:] = qpos
         mujoco.mj_forward(env.mj_model, data)
-        truth = np.asarray(env._draw(data))
+        truth = np.asarray(env._observer(data))
         assert np.mean(np.abs(image.astype(int) - truth) <= 1) > 0.995
     assert all(np.any(a != b) for a, b in itertools.combinations(np.asarray(images), 2))

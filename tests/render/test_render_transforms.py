@@ -1,5 +1,6 @@
 """Renderer under JAX transformations: vmap of scan, scan of vmap, donation, several devices; and its memory use."""
 
+import os
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -135,7 +136,8 @@ for kind, size, quantized in (("mesh", 16, False), ("capsule", 48, True)):
 
 
 def test_shard_map_over_two_devices(clean_environment):
-    environment = {**clean_environment, "XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    environment = {**clean_environment, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, "-c", SHARDED], env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.split() == ["mesh", "same", "capsule", "same"]

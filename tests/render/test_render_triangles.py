@@ -65,5 +65,5 @@ def test_bounds_leave_out_clusters_and_no_pixel(projection: str) -> None:
 def test_next_cluster_is_the_first_whose_count_exceeds_the_step() -> None:
     counts = np.cumsum(np.random.default_rng(0).integers(0, 2, 77))
     steps = np.arange(counts[-1] + 2)
-    found = jax.vmap(lambda step: triangles._kth(jnp.asarray(counts, jnp.int32), step))(jnp.asarray(steps, jnp.int32))
+    found = jax.vmap(lambda step: triangles.kth(jnp.asarray(counts, jnp.int32), step))(jnp.asarray(steps, jnp.int32))
     np.testing.assert_array_equal(found, np.searchsorted(counts, steps, side="right"))

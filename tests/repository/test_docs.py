@@ -245,7 +245,7 @@ def load_tool(name: str) -> Any:
 
 def test_the_configuration_page_is_that_of_the_source() -> None:
     tool = load_tool("configuration")
-    assert tool.PAGE.read_text() == tool.page(tool.PAGE.read_text()), "run python docs/tools/configuration.py"
+    assert tool.PAGE.read_text() == tool.update_page(tool.PAGE.read_text()), "run python docs/tools/configuration.py"
     assert set(read_keys(tool.PAGE, "fields")) == set(OPTIONS)
 
 

@@ -1,6 +1,7 @@
 """The first cell of the notebooks: it installs the package where it is missing, and stops with one line where it cannot."""
 
 import importlib.util
+import json
 import runpy
 import subprocess
 import tomllib
@@ -9,15 +10,15 @@ from typing import Any
 
 import pytest
 
-nbformat = pytest.importorskip("nbformat")
-nbclient = pytest.importorskip("nbclient")
-
 FOLDER = Path(__file__).resolve().parents[2] / "notebooks"
 INSTALL = runpy.run_path(str(FOLDER / "install.py"))
 
 
 def first_cell(path: Path) -> str:
-    return next(cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code")
+    cells = json.loads(path.read_text(encoding="utf-8"))[
+        "cells"
+    ]  # `nbformat` parses a grammar for a second when it is imported
+    return next("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
 
 
 CELL = first_cell(FOLDER / "01_quickstart.ipynb")
@@ -114,6 +115,7 @@ def test_a_failing_installation_stops_with_its_own_line(without_package, tmp_pat
 
 
 def test_a_notebook_shows_one_line_and_goes_no_further(tmp_path, monkeypatch):
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
     monkeypatch.delenv("JAXRL_VIS_REPOSITORY", raising=False)
     hide = "import importlib.util\nimportlib.util.find_spec = lambda name: None"
@@ -178,14 +180,14 @@ def test_what_pip_says_is_shown_where_it_fails(fake_pip, checkout, capsys):
 
 def test_a_replaced_package_that_was_in_use_asks_for_a_restart(fake_pip, checkout, monkeypatch):
     answers = iter([{"numpy": "1.26.0"}, {"numpy": "2.3.0", "jax": "0.10.1"}])
-    monkeypatch.setitem(INSTALL["install"].__globals__, "loaded", lambda: next(answers))
+    monkeypatch.setitem(INSTALL["install"].__globals__, "loaded_versions", lambda: next(answers))
     problem = INSTALL["install"](checkout)
     assert "numpy" in problem and "jax" not in problem.split(":")[0] and "restart" in problem
 
 
 def test_an_installation_that_went_well_says_nothing_more(fake_pip, checkout):
     assert INSTALL["install"](checkout) is None
-    assert {"numpy", "pytest"} <= set(INSTALL["loaded"]())
+    assert {"numpy", "pytest"} <= set(INSTALL["loaded_versions"]())
 
 
 @pytest.mark.parametrize(("driver", "is_limited"), [(None, True), (470, True), (580, False)])
@@ -196,7 +198,7 @@ def test_without_a_usable_gpu_versions_that_are_slow_on_a_cpu_are_left_out(drive
         calls.append(words)
         return subprocess.CompletedProcess(words, 0, stdout="")
 
-    monkeypatch.setitem(INSTALL["install"].__globals__, "driver", lambda: driver)
+    monkeypatch.setitem(INSTALL["install"].__globals__, "find_driver_version", lambda: driver)
     monkeypatch.setattr(subprocess, "run", run)
     assert INSTALL["install"](FOLDER.parent) is None
     (words,) = calls

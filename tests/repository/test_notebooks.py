@@ -29,13 +29,20 @@ SAID = {
     "06_grasping": ("3 pairs of 256 x 256 pixels", "default                      stitches off by", "of the thesis"),
 }
 
-nbformat = pytest.importorskip("nbformat")
-nbclient = pytest.importorskip("nbclient")
-jupyter_client = pytest.importorskip("jupyter_client")
+
+# Imported by the tests, because every worker collects this file: `nbformat` parses a grammar for a second.
+@pytest.fixture(scope="module")
+def nbformat() -> Any:
+    return pytest.importorskip("nbformat")
+
+
+@pytest.fixture(scope="module")
+def nbclient() -> Any:
+    return pytest.importorskip("nbclient")
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_outputs_are_stripped(path: Path) -> None:
+def test_outputs_are_stripped(path: Path, nbformat: Any) -> None:
     for cell in nbformat.read(path, as_version=4).cells:
         if cell.cell_type == "code":
             assert not cell.outputs
@@ -43,8 +50,9 @@ def test_outputs_are_stripped(path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def kernel(tmp_path_factory: pytest.TempPathFactory, nbclient: Any) -> Iterator[Any]:
     """A kernel for all notebooks, so that modules are imported once; each begins without the names of the one before."""
+    jupyter_client = pytest.importorskip("jupyter_client")
     checkout, ipython = Path(__file__).resolve().parents[2], tmp_path_factory.mktemp("ipython")
     startup = ipython / "profile_default/startup"
     startup.mkdir(parents=True)
@@ -63,7 +71,7 @@ def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs(path: Path, tmp_path: Path, kernel: Any) -> None:
+def test_notebook_runs(path: Path, tmp_path: Path, kernel: Any, nbformat: Any, nbclient: Any) -> None:
     notebook = nbformat.read(path, as_version=4)
     notebook.cells.insert(0, nbformat.v4.new_code_cell(f"%reset -f\n%cd -q {tmp_path}"))
     nbclient.NotebookClient(notebook, timeout=600, km=kernel).execute()

@@ -86,7 +86,7 @@ def test_goals_are_placed_shown_and_kept_within_their_box(session: live.Session)
     session.reset()
     np.testing.assert_allclose(session.state.goal_state, [0.3, -0.1, 0], err_msg="a reset moves no goal")
     assert session.distance == pytest.approx(np.hypot(0.3, 0.1)), "from the start to that goal"
-    session.new_goal()
+    session.sample_goal()
     assert not np.allclose(session.state.goal_state, [0.3, -0.1, 0])
 
 
@@ -237,12 +237,12 @@ def test_every_shape_has_its_size() -> None:
     assert live_scene.visible_geoms(mj_model, 0) == list(range(6))
     halves = [[0.1, 0.2, 0.3], [0.1] * 3, [0.1, 0.2, 0.3], [0.1, 0.1, 0.4], [0.1, 0.1, 0.3]]
     for geom, half in enumerate(halves):
-        mesh = live_scene.surface(mj_model, geom)
+        mesh = live_scene.geom_surface(mj_model, geom)
         assert mesh is not None
         np.testing.assert_allclose(mesh[0].max(axis=0), half, atol=2e-3)
         np.testing.assert_allclose(mesh[0].min(axis=0), -np.array(half), atol=2e-3)
         assert mesh[1].max() < len(mesh[0])
-    mesh = live_scene.surface(mj_model, 5)
+    mesh = live_scene.geom_surface(mj_model, 5)
     assert mesh is not None and len(mesh[0]) == 4
 
 

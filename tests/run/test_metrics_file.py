@@ -55,10 +55,10 @@ def test_a_damaged_line_is_kept_aside_and_told(tmp_path, kind):
     rows = [row(1), row(3)]
     path.write_bytes(b"%s\n%s\n%s\n" % (json.dumps(rows[0]).encode(), DAMAGED[kind], json.dumps(rows[1]).encode()))
     assert metrics.read_rows(path) == rows
-    said = metrics.cut_back(path, 3, None, aside, aside, keeps_later=False)
+    said = metrics.truncate(path, 3, None, aside, aside, keeps_later=False)
     assert said is not None and "1 damaged line (line 2)" in said and str(aside) in said and "\n" not in said
     assert aside.read_bytes() == DAMAGED[kind] + b"\n" and metrics.read_contents(path).damaged == []
-    assert metrics.read_rows(path) == rows and metrics.cut_back(path, 3, None, aside, aside, keeps_later=False) is None
+    assert metrics.read_rows(path) == rows and metrics.truncate(path, 3, None, aside, aside, keeps_later=False) is None
 
 
 @pytest.mark.parametrize("torn", [b'{"seed": 0, "iter', b'{"seed": 0, "eval/\xc3', b"\0" * 50])
@@ -67,7 +67,7 @@ def test_what_a_kill_has_left_of_the_last_line_is_not_told(tmp_path, torn):
     metrics.append_rows(path, [row(1)])
     path.write_bytes(path.read_bytes() + torn)
     assert metrics.read_contents(path) == metrics.Contents([row(1)], [], torn)
-    assert metrics.cut_back(path, 9, None, tmp_path / "aside", tmp_path / "aside", keeps_later=False) is None
+    assert metrics.truncate(path, 9, None, tmp_path / "aside", tmp_path / "aside", keeps_later=False) is None
     assert path.read_text() == json.dumps(row(1)) + "\n" and not (tmp_path / "aside").exists()
 
 

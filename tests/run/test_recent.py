@@ -133,7 +133,7 @@ def test_no_room_is_said_once_and_ends_nothing(states, tmp_path, monkeypatch):
 
     monkeypatch.setattr(recent, "_bytes", full_disk)
     keeper.save(2, states[0][2], E, {})
-    assert len(lines) == 1 and "No space left on device" in lines[0] and not keeper.is_due(in_any_case=True)
+    assert len(lines) == 1 and "No space left on device" in lines[0] and not keeper.is_due(ignore_time=True)
     # What there is stays until a checkpoint is as new: the run may never find room for one.
     assert keeper.iterations() == [1] and not list((tmp_path / RECENT).glob("*.tmp"))
     monkeypatch.undo()

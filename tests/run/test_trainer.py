@@ -211,7 +211,7 @@ def test_metrics_file_survives_a_torn_line(tmp_path):
         file.write('{"seed": 0, "iter')
     assert metrics.read_rows(path) == rows
     aside = tmp_path / "aside.jsonl"
-    assert metrics.cut_back(path, 1, None, aside, aside, keeps_later=False) is None and not aside.exists()
+    assert metrics.truncate(path, 1, None, aside, aside, keeps_later=False) is None and not aside.exists()
     assert path.read_text().count("\n") == 2 and metrics.read_rows(path) == rows[:2]
     assert metrics.make_rows([3], {"iteration": 1}, {"a": [float("nan")]}) == [{"seed": 3, "iteration": 1, "a": None}]
 

@@ -90,7 +90,7 @@ def test_on_a_terminal_there_is_a_question(stranger, monkeypatch, answer, runs):
 
 def test_what_was_trusted_is_remembered_for_that_run_and_that_code(stranger, cache, here, monkeypatch):
     config = read_config(stranger)
-    trust.check(stranger, config, may=True)
+    trust.check(stranger, config, is_permitted=True)
     monkeypatch.setattr(trust, "_trusted_here", set())  # as another process
     assert trust.is_trusted(stranger, config)
     copy = shutil.copytree(stranger, here / "copy")
@@ -132,7 +132,7 @@ def test_a_cache_that_cannot_be_written_is_no_hindrance(stranger, cache):
     cache.parent.parent.mkdir()
     cache.parent.write_text("a file")
     config = read_config(stranger)
-    trust.check(stranger, config, may=True)
+    trust.check(stranger, config, is_permitted=True)
     assert trust.is_trusted(stranger, config)  # by this process
 
 
@@ -148,5 +148,5 @@ def test_a_task_that_is_not_so_written_is_one_line(stranger, capsys, env):
 def test_tasks_of_this_project_are_not_asked_about(here, cache):
     run = here / "run"
     RunFolder(run).open(preset("debug"))
-    trust.check(run, read_config(run), may=False)
+    trust.check(run, read_config(run), is_permitted=False)
     assert not cache.exists()

@@ -22,13 +22,13 @@ from jaxrl_vis.run.storage.metrics import RUN_ID
 from jaxrl_vis.run.storage.sums import compare_sums, write_sums
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis.run.verifying import verification
-from jaxrl_vis.run.verifying.inspection import Expected, Findings, check_record, missing_rows, read_file
+from jaxrl_vis.run.verifying.inspection import Findings, RowConditions, check_record, missing_rows, read_file
 from jaxrl_vis.run.verifying.verification import Verification, verify
 
 
-def expected_in(path: Path) -> Expected:
+def expected_in(path: Path) -> RowConditions:
     """Conditions on the rows of the run of eight iterations."""
-    return Expected(seeds=[0, 1], updates=3, env_steps=10, eval_interval=2, run_id=read_run_id(path))
+    return RowConditions(seeds=[0, 1], updates=3, env_steps=10, eval_interval=2, run_id=read_run_id(path))
 
 
 @pytest.fixture(scope="module")

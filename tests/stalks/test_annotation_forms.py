@@ -320,12 +320,12 @@ def test_regions_of_many_stalks_are_neither_stalks_nor_background(tmp_path):
     from tiny_detector import TINY
 
     from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, UNCLEAR
-    from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, settings_for
+    from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, fit_settings
 
     data = json.loads(coco("r.png"))
     crowd = {"id": 9, "image_id": 1, "category_id": 1, "iscrowd": 1, "bbox": [60, 10, 30, 70]}
     put(tmp_path, {"annotations.json": json.dumps({**data, "annotations": [*data["annotations"], crowd]})}, "r.png")
-    assert settings_for(tmp_path, TINY).anchor_widths[-1] < 12 * TINY.width / WIDTH
+    assert fit_settings(tmp_path, TINY).anchor_widths[-1] < 12 * TINY.width / WIDTH
     (example,) = annotated_examples(tmp_path, TINY)
     assert (example.kinds == STALK).sum() == 2 and len(example.crops) == 2
     strips = example.stalks[example.kinds == UNCLEAR] * WIDTH / example.image.shape[1]

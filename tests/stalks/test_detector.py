@@ -12,34 +12,38 @@ from tiny_detector import TINY
 from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.host.weights_file import write_parameters
 from jaxrl_vis.stalks.phenotyping.detector.anchors import decode, encode, make_anchors
-from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap, roi_align, suppress
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals
+from jaxrl_vis.stalks.phenotyping.detector.boxes import box_iou, non_maximum_suppression, roi_align, strip_overlap
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, select_proposals
 from jaxrl_vis.stalks.phenotyping.detector.doubles import suppress_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
-from jaxrl_vis.stalks.phenotyping.detector.losses import assign
+from jaxrl_vis.stalks.phenotyping.detector.losses import assign_boxes
 from jaxrl_vis.stalks.phenotyping.detector.sections import NOTHING, STALK, UNCLEAR
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, paste
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut_crops, paste_crop
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
-from jaxrl_vis.stalks.phenotyping.io.images import rgb8
+from jaxrl_vis.stalks.phenotyping.io.images import to_rgb8
 from jaxrl_vis.stalks.phenotyping.io.masks import decode_counts
-from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, settings_for
-from jaxrl_vis.stalks.phenotyping.training.augment import augment_crops, move
+from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, fit_settings
+from jaxrl_vis.stalks.phenotyping.training.augment import augment_crops, augment_geometry
 from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, _Pool, train
 from jaxrl_vis.stalks.phenotyping.training.examples import MAX_STALKS, Example, _instance_masks, synthetic_examples
 from jaxrl_vis_envs.plants import family
 
 # One program each, in place of one for every operation in them.
-band_overlap, overlap = jax.jit(band_overlap), jax.jit(overlap)
+strip_overlap, box_iou = jax.jit(strip_overlap), jax.jit(box_iou)
 encode, decode, augment_crops = jax.jit(encode), jax.jit(decode), jax.jit(augment_crops)
-roi_align, best_proposals = jax.jit(roi_align, static_argnums=(2, 3, 4, 5)), jax.jit(best_proposals, static_argnums=(3, 4))
-assign, suppress, move = jax.jit(assign), jax.jit(suppress), jax.jit(move)
+roi_align, select_proposals = jax.jit(roi_align, static_argnums=(2, 3, 4, 5)), jax.jit(select_proposals, static_argnums=(3, 4))
+assign_boxes, non_maximum_suppression, augment_geometry = (
+    jax.jit(assign_boxes),
+    jax.jit(non_maximum_suppression),
+    jax.jit(augment_geometry),
+)
 
 
 @jax.jit
 def nms(boxes, scores, threshold, valid=None):
     """Non-maximum suppression of boxes [N, 4] by intersection over union, as torchvision's."""
-    return suppress(overlap(boxes, boxes), scores, threshold, valid)
+    return non_maximum_suppression(box_iou(boxes, boxes), scores, threshold, valid)
 
 
 RECORDED = np.load(Path(__file__).parent / "data" / "torchvision_boxes.npz")
@@ -85,10 +89,10 @@ def test_parallel_stalks_that_lean_are_two():
     beside = [12.0, 2.0, 52.0, 137.0, 47.0, 17.0]
     again = [1.0, 3.0, 41.0, 138.0, 36.0, 6.0]
     stalks = jnp.array([first, beside, again])
-    overlaps = np.asarray(band_overlap(stalks, stalks))
-    assert np.asarray(overlap(stalks[:, :4], stalks[:, :4]))[0, 1] > 0.5
+    overlaps = np.asarray(strip_overlap(stalks, stalks))
+    assert np.asarray(box_iou(stalks[:, :4], stalks[:, :4]))[0, 1] > 0.5
     assert overlaps[0, 1] < 0.01 and overlaps[0, 2] > 0.6
-    assert suppress(jnp.asarray(overlaps), jnp.array([0.9, 0.8, 0.7]), 0.4).tolist() == [True, True, False]
+    assert non_maximum_suppression(jnp.asarray(overlaps), jnp.array([0.9, 0.8, 0.7]), 0.4).tolist() == [True, True, False]
 
 
 def test_a_stalk_that_two_finds_outline_is_one():
@@ -130,12 +134,12 @@ def test_proposals_are_the_best_anchors_and_no_copies():
     shape = (64, 64)
     anchors = jnp.asarray(make_anchors(shape, 30.0, (6.0, 12.0)))
     logits = jnp.full(len(anchors), -5.0).at[jnp.array([40, 42, 90])].set(jnp.array([3.0, 2.0, 4.0]))
-    stalks, scores, valid = best_proposals(logits, jnp.zeros((len(anchors), 6)), anchors, TINY, shape)
+    stalks, scores, valid = select_proposals(logits, jnp.zeros((len(anchors), 6)), anchors, TINY, shape)
     assert stalks.shape == (12, 6) and valid.shape == (12,)
     assert scores[0] == 4.0
     kept = np.asarray(stalks)[np.asarray(valid)]
     assert kept[:, :4].min() >= 0 and kept[:, :4].max() <= 64
-    between = np.array(band_overlap(jnp.asarray(kept), jnp.asarray(kept)))
+    between = np.array(strip_overlap(jnp.asarray(kept), jnp.asarray(kept)))
     np.fill_diagonal(between, 0)
     assert between.max() <= TINY.proposal_threshold
 
@@ -148,14 +152,14 @@ def test_copies_of_a_stalk_leave_room_for_another():
     codes = jnp.zeros((len(anchors), 6))
     for candidates, wanted in ((99, [easy]), (100, [easy, hard])):
         settings = dataclasses.replace(TINY, candidates=candidates)
-        stalks, _, valid = best_proposals(logits, codes, anchors, settings, (60, 64))
+        stalks, _, valid = select_proposals(logits, codes, anchors, settings, (60, 64))
         np.testing.assert_allclose(stalks[valid], jnp.stack(wanted), atol=1e-5)
 
 
 def test_boxes_on_unclear_stalks_are_neither_right_nor_wrong():
     truth = jnp.array([[10.0, 0, 20, 60], [40, 0, 50, 60], [70, 0, 80, 60]])
     kinds = jnp.array([STALK, UNCLEAR, NOTHING])
-    which, shows, none = assign(overlap(truth, truth), kinds, 0.5, 0.3)
+    which, shows, none = assign_boxes(box_iou(truth, truth), kinds, 0.5, 0.3)
     assert which[0] == 0 and shows.tolist() == [True, False, False] and none.tolist() == [False, False, True]
 
 
@@ -166,8 +170,8 @@ def test_a_crop_is_put_back_where_it_was():
     rng = np.random.default_rng(1)
     image = rng.uniform(0.1, 1, (60, 50)).astype(np.float32)
     stalk = np.array([18.0, 5, 40, 55, 36, 20], np.float32)
-    crop = np.asarray(cut(jnp.asarray(image), stalk[None], (48, 16)))[0]
-    back, (line, column) = paste(crop, stalk, image.shape)
+    crop = np.asarray(cut_crops(jnp.asarray(image), stalk[None], (48, 16)))[0]
+    back, (line, column) = paste_crop(crop, stalk, image.shape)
     there = image[line : line + back.shape[0], column : column + back.shape[1]]
     assert (back > 0).sum() == 48 * 16
     np.testing.assert_array_equal(back[back > 0], there[back > 0])
@@ -179,11 +183,11 @@ def test_a_crop_is_put_back_where_it_was():
 def test_crops_at_the_images_edge_are_black_beyond_it():
     image = np.ones((40, 30), np.float32)
     stalk = np.array([-4.0, 10, 6, 40, 1, 1], np.float32)
-    crop = np.asarray(cut(jnp.asarray(image), stalk[None], (32, 16)))[0]
+    crop = np.asarray(cut_crops(jnp.asarray(image), stalk[None], (32, 16)))[0]
     assert crop[:, :7].max() == 0 and crop[:31, 7:].min() == 1
-    back, corner = paste(crop, stalk, image.shape)
+    back, corner = paste_crop(crop, stalk, image.shape)
     assert corner == (9, 0) and back.min() == 1
-    nowhere, _ = paste(crop, stalk + 100, image.shape)
+    nowhere, _ = paste_crop(crop, stalk + 100, image.shape)
     assert nowhere.size == 0
 
 
@@ -209,8 +213,8 @@ def drawing(seed: int) -> Example:
     stalk = np.array([min(top, bottom) - 3, 15, max(top, bottom) + 3, 45, top, bottom], np.float32)
     stalks, kinds = np.zeros((MAX_STALKS, 6), np.float32), np.zeros(MAX_STALKS, np.int32)
     stalks[0], kinds[0] = stalk, STALK
-    crops = np.asarray(cut(jnp.asarray(image), stalk[None], (32, 16)))
-    masks = np.asarray(cut(jnp.asarray(mask), stalk[None], (32, 16)))
+    crops = np.asarray(cut_crops(jnp.asarray(image), stalk[None], (32, 16)))
+    masks = np.asarray(cut_crops(jnp.asarray(mask), stalk[None], (32, 16)))
     return Example(image, stalks, kinds, crops, masks)
 
 
@@ -224,7 +228,7 @@ def test_stalks_move_with_their_images():
     narrow = stalks[:, 0, 2] < 44
     images[narrow, :, 48:], sizes[narrow, 1] = 0, 48
     assert 0 < narrow.sum() < len(images)
-    moved, places, kinds = move(
+    moved, places, kinds = augment_geometry(
         jnp.asarray(images), jnp.asarray(stalks), jnp.asarray(kinds), jnp.asarray(sizes), jax.random.key(0)
     )
     assert moved.dtype == jnp.uint8
@@ -252,12 +256,12 @@ def test_images_of_several_sizes_are_batched_together():
         pool.fill(26)
         rng = np.random.default_rng(0)
         for _ in range(4):
-            images, stalks, kinds, sizes = pool.images(rng)
+            images, stalks, kinds, sizes = pool.sample_images(rng)
             assert images.shape == (16, 128, 160, 3) and stalks.shape[:2] == kinds.shape
             assert {tuple(size) for size in sizes} <= {(60, 64), (100, 134)}
             for image, size in zip(images, sizes):
                 np.testing.assert_array_equal(image[size[0] :], 0)
-            strips = pool.strips(rng)
+            strips = pool.sample_crops(rng)
             assert strips is not None and strips[0].shape[:3] == strips[1].shape
     finally:
         pool.close()
@@ -289,7 +293,7 @@ def test_networks_learn_to_find_and_outline(trained, tmp_path):
         assert found == sorted(found, key=lambda each: sum(each.axis))
         best = max(found, key=lambda each: each.score)
         box = np.array(best.box)[None] + 0.5
-        overlaps.append(float(overlap(jnp.asarray(box), jnp.asarray(example.stalks[:1, :4]))[0, 0]))
+        overlaps.append(float(box_iou(jnp.asarray(box), jnp.asarray(example.stalks[:1, :4]))[0, 0]))
         (line, column), (tall, wide) = best.corner, best.mask.shape
         bright = example.image[line : line + tall, column : column + wide, 0] > 120
         agreement.append(((best.mask > 0.5) & bright).sum() / ((best.mask > 0.5) | bright).sum())
@@ -315,7 +319,7 @@ def test_masks_of_crops_are_cut_out_of_what_each_pixel_shows():
     places = np.array([[8.0, 4, 16, 36, 10, 14], [16, 4, 24, 36, 20, 20], [24, -10, 32, 30, 30, 30]])
     masks = _instance_masks(instance, np.array([0, 1, 2]), np.arange(3), places, (48, 16))
     for part, mask in enumerate(masks):
-        np.testing.assert_array_equal(mask, np.asarray(cut(instance == part, places[part : part + 1], (48, 16)))[0])
+        np.testing.assert_array_equal(mask, np.asarray(cut_crops(instance == part, places[part : part + 1], (48, 16)))[0])
         assert mask.any()
 
 
@@ -387,7 +391,7 @@ def test_annotations_of_ones_own(tmp_path):
         ],
     }
     (tmp_path / "annotations.json").write_text(json.dumps(data))
-    settings = settings_for(tmp_path, dataclasses.replace(TINY, band_height=40.0))  # as tall as the boxes: nothing is resized
+    settings = fit_settings(tmp_path, dataclasses.replace(TINY, band_height=40.0))  # as tall as the boxes: nothing is resized
     assert settings.band_height == 40.0 and 8.0 <= settings.anchor_widths[0] < settings.anchor_widths[-1] <= 16.0
     (example,) = annotated_examples(tmp_path, settings)
     assert (example.kinds == STALK).sum() == 2 and example.crops.shape == (2, 32, 24, 3)  # twice as wide as the boxes
@@ -398,7 +402,7 @@ def test_annotations_of_ones_own(tmp_path):
         next(annotated_examples(tmp_path, settings))
     (tmp_path / "annotations.json").write_text("{}")
     with pytest.raises(RequestError, match="is not COCO"):
-        settings_for(tmp_path, TINY)
+        fit_settings(tmp_path, TINY)
 
 
 def test_annotations_of_voc_and_labelme_are_those_of_coco(tmp_path):
@@ -447,6 +451,6 @@ def test_runs_that_are_text():
 def test_images_of_any_depth_become_eight_bits():
     for bits in (10, 12, 14, 16):
         image = np.linspace(0, (1 << bits) - 1, 64).astype(np.uint16).reshape(8, 8)
-        image8 = rgb8(image)
+        image8 = to_rgb8(image)
         assert image8.shape == (8, 8, 3) and image8.dtype == np.uint8 and (image8.min(), image8.max()) == (0, 255)
-    assert rgb8(np.full((2, 2, 3), 7, np.uint8)).tolist() == np.full((2, 2, 3), 7).tolist()
+    assert to_rgb8(np.full((2, 2, 3), 7, np.uint8)).tolist() == np.full((2, 2, 3), 7).tolist()

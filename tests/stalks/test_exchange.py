@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.tables.field_plan import missing_plots, read_field_plan
-from jaxrl_vis.stalks.phenotyping.report.exchange import TRAITS, with_terms, write_exchange
+from jaxrl_vis.stalks.phenotyping.report.exchange import TRAITS, replace_terms, write_exchange
 from jaxrl_vis.stalks.phenotyping.report.tables import PLOT_COLUMNS
 
 ROW = {
@@ -36,7 +36,7 @@ COLUMNS = ("range", "row", "genotype", "flag")
 
 
 def write(out: Path, form) -> str:
-    return write_exchange(out, form, [ROW, EMPTY], COLUMNS, PLAN, with_terms(["stalks=CO_324:0000001"]))
+    return write_exchange(out, form, [ROW, EMPTY], COLUMNS, PLAN, replace_terms(["stalks=CO_324:0000001"]))
 
 
 def test_every_trait_is_a_column_of_plots():
@@ -123,7 +123,7 @@ def test_plantcv_is_as_its_own_reader_walks_through_it(tmp_path):
 @pytest.mark.parametrize("words", ["stalks", "none=TO:1", "stalks=", "=TO:1"])
 def test_terms_name_a_column(words):
     with pytest.raises(RequestError, match="--term takes COLUMN=TERM"):
-        with_terms([words])
+        replace_terms([words])
 
 
 # --- plans of fields ---

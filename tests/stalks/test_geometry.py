@@ -13,8 +13,8 @@ from jaxrl_vis.stalks.phenotyping.detector.finder import (
     Band,
     Detection,
     _clear_border_rows,
-    _in_whole_image,
     _is_inside_frame,
+    _to_full_image,
     pad_to_training_height,
     resize,
 )
@@ -24,9 +24,9 @@ from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
 from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, find_frame
-from jaxrl_vis.stalks.phenotyping.measure.lens import TRIED, lens_fault
+from jaxrl_vis.stalks.phenotyping.measure.lens import VALIDATED, lens_fault
 from jaxrl_vis.stalks.phenotyping.report.tables import Origin, plot_rows
-from jaxrl_vis.stalks.phenotyping.track.follow import Path, Track, follow
+from jaxrl_vis.stalks.phenotyping.track.follow import RobotPath, Track, track_stalks
 from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, measure_pair, view_pair
 from jaxrl_vis_envs.plants import Calibration
@@ -99,7 +99,7 @@ def test_lenses_that_were_not_tried_are_told(focal, size, distance, told):
         assert fault is None
     else:
         assert fault is not None and told in fault and "that were tried: use" in fault and "\n" not in fault
-        assert f"{TRIED.pixels_per_metre:.0f}" in fault or f"{TRIED.view:.2f} m" in fault
+        assert f"{VALIDATED.pixels_per_metre:.0f}" in fault or f"{VALIDATED.view:.2f} m" in fault
 
 
 def test_widths_do_not_depend_on_crops_borders_and_lenses():
@@ -170,15 +170,15 @@ def test_the_field_of_a_crop_is_its_own():
     narrow = dataclasses.replace(CAMERA, width=200, centre=(-300.0, 199.5))
     frames = [[Sighting((0, 0, 1, 1), (0, 0), 1.0, 200.0, 100.0, diameter_mm=14.0, depth_m=0.8, along_m=0.54)]]
     frames += [[] for _ in range(8)]
-    (track,), path = follow(frames, np.arange(9) * 0.1, narrow)
+    (track,), path = track_stalks(frames, np.arange(9) * 0.1, narrow)
     assert track.counted
-    assert path.seen == pytest.approx(0.51, abs=0.01)  # it begins 0.39 m to the right of where the robot did
+    assert path.seen_fraction == pytest.approx(0.51, abs=0.01)  # it begins 0.39 m to the right of where the robot did
     # The whole image, of which it may be a part, would have shown it in more pairs; what is letterboxed shows no more.
     whole = dataclasses.replace(narrow, width=800, centre=(300.0, 199.5))
     frames[0][0] = dataclasses.replace(frames[0][0], column=700.0)
-    (track,), path = follow(frames, np.arange(9) * 0.1, whole)
-    assert path.seen == 1.0 and track.reason.startswith("seen in 1 of")
-    (track,), _ = follow(frames, np.arange(9) * 0.1, whole, columns=(600.0, 800.0))
+    (track,), path = track_stalks(frames, np.arange(9) * 0.1, whole)
+    assert path.seen_fraction == 1.0 and track.reason.startswith("seen in 1 of")
+    (track,), _ = track_stalks(frames, np.arange(9) * 0.1, whole, columns=(600.0, 800.0))
     assert track.counted
 
 
@@ -192,7 +192,7 @@ def test_a_row_that_is_not_seen_as_a_whole_has_no_count():
         (0.97, 1, "few frames"),
         (0.9, "", "part of the row not seen; few frames"),
     ):
-        stalks, row = plot_rows([[find]], [track], Path(np.zeros(1), 0.5, seen), 0, origin)
+        stalks, row = plot_rows([[find]], [track], RobotPath(np.zeros(1), 0.5, seen), 0, origin)
         assert len(stalks) == 1 and stalks[0]["width_mm"] == "14.000"
         assert row["stalks"] == count and row["flag"] == flag and (row["stalks_per_m"] == "") == (count == "")
 
@@ -251,7 +251,7 @@ def test_finds_on_borders_are_none_and_masks_end_before_them():
     mask[2:, :5] = 0.0
     np.testing.assert_array_equal(_clear_border_rows(mask, (10, 25), frame).any(axis=1), [False, False, True, True])
     find = Detection((1.0, 2.0, 3.0, 4.0), (1.5, 2.5), 1.0, mask, (2, 1), (mask, (0, 1)))
-    moved = _in_whole_image(find, Frame((7, 100), (30, 80)))
+    moved = _to_full_image(find, Frame((7, 100), (30, 80)))
     assert moved.box == (31.0, 9.0, 33.0, 11.0) and moved.axis == (31.5, 32.5) and moved.corner == (9, 31)
     assert moved.upper is not None and moved.upper[1] == (7, 31)
 

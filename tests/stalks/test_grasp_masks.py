@@ -10,9 +10,9 @@ import pytest
 from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.host.weights_file import write_parameters
 from jaxrl_vis.stalks.grasping.masks.examples import Example
-from jaxrl_vis.stalks.grasping.masks.mask_training import Plan, crops, train
+from jaxrl_vis.stalks.grasping.masks.mask_training import Plan, sample_crops, train
 from jaxrl_vis.stalks.grasping.masks.painter import Painter, Settings, read_weights, write_weights
-from jaxrl_vis.stalks.grasping.masks.variation import vary
+from jaxrl_vis.stalks.grasping.masks.variation import augment
 from jaxrl_vis.stalks.grasping.perception.cloud import redness
 
 
@@ -28,7 +28,7 @@ def striped(seed: int) -> Example:
 
 def test_crops_are_parts_of_images_with_their_masks():
     examples = [striped(0), Example(np.full((20, 20, 3), 7, np.uint8), np.ones((20, 20), bool))]
-    images, masks = crops(examples, np.random.default_rng(0), 12, 32)
+    images, masks = sample_crops(examples, np.random.default_rng(0), 12, 32)
     assert images.shape == (12, 32, 32, 3) and masks.shape == (12, 32, 32)
     small = (images[:, 0, 0] == 7).all(axis=-1)
     assert 0 < small.sum() < 12
@@ -40,7 +40,7 @@ def test_varied_crops_keep_their_masks():
     masks = np.zeros((16, 64, 64), bool)
     masks[:, :, 20:30] = True
     images = np.where(masks[..., None], 140, np.full(3, 40)).astype(np.uint8)
-    varied, moved = (np.asarray(each) for each in vary(jnp.asarray(images), jnp.asarray(masks), jax.random.key(0)))
+    varied, moved = (np.asarray(each) for each in augment(jnp.asarray(images), jnp.asarray(masks), jax.random.key(0)))
     assert varied.dtype == np.uint8 and varied.shape == images.shape and moved.dtype == bool
     kept = [(varied[each] == images[each]).all() or (varied[each] == images[each, :, ::-1]).all() for each in range(16)]
     assert 0 < sum(kept) < 8
@@ -51,7 +51,7 @@ def test_varied_crops_keep_their_masks():
         assert one[mask].mean() > one[~mask].mean()
     assert len({round(float(each.mean())) for each in varied}) > 5
     assert len({int(np.flatnonzero(each[32]).mean()) for each in moved}) > 2
-    other, _ = vary(jnp.asarray(images), jnp.asarray(masks), jax.random.key(1))
+    other, _ = augment(jnp.asarray(images), jnp.asarray(masks), jax.random.key(1))
     assert (np.asarray(other) != varied).any()
 
 

@@ -15,10 +15,10 @@ from PIL import Image
 import jaxrl_vis_envs
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.grasping.arm import approach, control
-from jaxrl_vis.stalks.grasping.arm.choice import MIN_ROOM, choose, choose_nearest
+from jaxrl_vis.stalks.grasping.arm.choice import MIN_CLEARANCE, choose_approaches, choose_nearest
 from jaxrl_vis.stalks.grasping.arm.policy_loop import STALKS, check_policy, reach_by_policy
-from jaxrl_vis.stalks.grasping.arm.reach import LOOK, ArmView, ReachResult, arms_among, reach
-from jaxrl_vis.stalks.grasping.evaluation.attempts import follow, wind_keys
+from jaxrl_vis.stalks.grasping.arm.reach import LOOK_INTERVAL, ArmView, ReachResult, build_arm_model, reach
+from jaxrl_vis.stalks.grasping.evaluation.attempts import redetecting_observer, wind_keys
 from jaxrl_vis.stalks.grasping.perception.lines import GraspPoint
 from jaxrl_vis.stalks.grasping.report import path_figure, video
 from jaxrl_vis_envs.plants import TRAINING, bending, draw
@@ -84,7 +84,7 @@ def test_both_solutions_bring_the_grip_to_the_target():
 
 
 def test_the_model_has_the_dimensions_that_the_formulas_have():
-    model = arms_among(4).mj_model
+    model = build_arm_model(4).mj_model
     data = mujoco.MjData(model)
     for target in ([0.1, -0.05, 0.6], [-0.3, 0.02, 1.1]):
         data.qpos[:3] = stalk_arm.joints_at(np.array(target), -1.0, np)
@@ -131,7 +131,7 @@ def test_room_is_the_least_distance_of_the_open_gripper_from_others():
     target = np.array([[0.0, 0.0, HEIGHT]])
 
     def beside(x: float, y: float = 0.0, whole_way: bool = False) -> float:
-        return float(approach.room(target, np.array([[[x, y]]]), np.array([[0.006]]), whole_way).max())
+        return float(approach.clearance(target, np.array([[[x, y]]]), np.array([[0.006]]), whole_way).max())
 
     assert beside(np.nan) == np.inf
     assert beside(0.06) > beside(0.045) > beside(0.03)
@@ -144,7 +144,7 @@ def test_the_folded_arm_needs_room_as_it_turns():
     target = np.array([[-0.42, -0.1, HEIGHT]])
 
     def beside(x: float, y: float, whole_way: bool = True) -> float:
-        return float(approach.room(target, np.array([[[x, y]]]), np.array([[0.006]]), whole_way).max())
+        return float(approach.clearance(target, np.array([[[x, y]]]), np.array([[0.006]]), whole_way).max())
 
     assert beside(-0.12, -0.22) < 0 < beside(0.12, -0.22)  # it turns to the left
     assert beside(-0.12, -0.1) > 0.005  # behind where it turns
@@ -194,10 +194,10 @@ def test_a_stand_of_nothing_is_refused_in_one_line():
 
 def test_a_stalk_gives_way_like_a_beam():
     """Pushed at several heights in C MuJoCo, against 3 EI / z^3 of a beam without taper."""
-    arms, radius = arms_among(4), 0.006
+    arms, radius = build_arm_model(4), 0.006
     model = arms.mj_model.__copy__()
     shape = jax.tree.map(lambda part: part[0], bending.shapes(stands()))
-    fitted = bending.fit(arms.model, arms.layout, shape)
+    fitted = bending.set_stalk_properties(arms.model, arms.layout, shape)
     for name in ("body_pos", "body_ipos", "body_mass", "body_inertia", "jnt_stiffness", "dof_damping"):
         getattr(model, name)[:] = getattr(fitted, name)
     rigidity = bending.MODULUS * np.pi * radius**4 / 4
@@ -218,14 +218,14 @@ def test_a_stalk_gives_way_like_a_beam():
 
 def test_stalks_sway_as_far_as_they_are_said_to():
     foot = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]], np.float32)
-    gusts = jax.vmap(lambda key: bending.gusts(key, 0.02))(jax.random.split(jax.random.key(0), 64))
+    gusts = jax.vmap(lambda key: bending.sample_gusts(key, 0.02))(jax.random.split(jax.random.key(0), 64))
     times = jnp.linspace(0.0, 60.0, 400)
     sway = jax.vmap(lambda gust: jax.vmap(lambda time: bending.displacement(gust, foot, time))(times))(gusts)
     distance = np.linalg.norm(np.asarray(sway), axis=-1)
     np.testing.assert_allclose(np.sqrt((distance**2).mean()), 0.02 / np.sqrt(2), rtol=0.05)
     # Where the hinges stand so, the stalk is there at the height that counts.
-    layout, rest = arms_among(4).layout, arms_among(4).rest
-    model = arms_among(4).mj_model
+    layout, rest = build_arm_model(4).layout, build_arm_model(4).rest
+    model = build_arm_model(4).mj_model
     data = mujoco.MjData(model)
     moved = np.tile(np.array([[0.01, -0.004]], np.float32), (4, 1))
     data.qpos[:] = bending.hinge_angles(layout, model.nv, jnp.asarray(moved))
@@ -282,7 +282,7 @@ def test_wind_moves_stalks_away_from_blind_jaws_and_looking_helps():
         return sight.stalks[:, slot]
 
     seeing = reach(scenes, targets, key, wind, observer=look)
-    assert times == pytest.approx([LOOK * count for count in range(1, 24)])
+    assert times == pytest.approx([LOOK_INTERVAL * count for count in range(1, 24)])
     assert seeing.held[:, slot].sum() > blind.held[:, slot].sum()
     assert not blind.held[:, slot].all()
     # Nothing seen, nothing changed.
@@ -305,7 +305,7 @@ def test_an_arm_meets_the_same_wind_in_any_company():
 def test_what_is_found_again_is_late_wrong_by_as_much_and_expected_to_go_on():
     scenes = Stands(**{field.name: getattr(stands(), field.name)[:3] for field in dataclasses.fields(Stands)})
     slots = [int(np.flatnonzero(scenes.stalk[each] == each)[0]) for each in (0, 1)]
-    look = follow(scenes, np.array([0, 1, -1]), np.array([[0.002, 0.0], [np.nan, np.nan], [0.0, 0.0]]))
+    look = redetecting_observer(scenes, np.array([0, 1, -1]), np.array([[0.002, 0.0], [np.nan, np.nan], [0.0, 0.0]]))
     found = []
     for time in range(4):
         stalks = np.zeros((3, 4, 3))
@@ -326,20 +326,20 @@ def line(x: float, y: float, slope: float = 0.0) -> GraspPoint:
 
 def test_the_height_with_most_room_is_taken_and_what_is_blocked_is_refused():
     stops = np.array([stand_origin(x) for x in (-0.1, 0.0, 0.1)])
-    (alone,) = choose([line(0.0, 0.0)], stops)
+    (alone,) = choose_approaches([line(0.0, 0.0)], stops)
     assert not alone.is_blocked and alone.point[2] == HEIGHT and alone.room == np.inf
     # A neighbour that leans over the target at its height, and away from it below.
-    leaning, other = choose([line(0.0, 0.0), line(0.02, -0.03, -0.3)], stops)
-    assert leaning.point[2] < HEIGHT and leaning.room > MIN_ROOM
+    leaning, other = choose_approaches([line(0.0, 0.0), line(0.02, -0.03, -0.3)], stops)
+    assert leaning.point[2] < HEIGHT and leaning.room > MIN_CLEARANCE
     # Its neighbour is as thick as it is at the height of the grasp, and where it bends to.
     bent = dataclasses.replace(line(0.1, 0.0), bend=(-0.5, 0.0), taper=-0.02)
-    rooms = [choose([line(0.0, 0.0), each], stops, (0.45, 0.45))[0].room for each in (line(0.1, 0.0), bent)]
+    rooms = [choose_approaches([line(0.0, 0.0), each], stops, (0.45, 0.45))[0].room for each in (line(0.1, 0.0), bent)]
     up = 0.45 - HEIGHT
     assert rooms[0] - rooms[1] == pytest.approx(0.5 * up**2 - 0.5 * 0.02 * up, abs=0.003)
     # Two that stand as near at every height.
-    assert all(each.is_blocked for each in choose([line(0.0, 0.0), line(0.015, 0.0)], stops))
+    assert all(each.is_blocked for each in choose_approaches([line(0.0, 0.0), line(0.015, 0.0)], stops))
     # What is out of reach is not blocked.
-    (far,) = choose([line(2.0, 0.0)], stops)
+    (far,) = choose_approaches([line(2.0, 0.0)], stops)
     assert far.stop == -1 and not far.is_blocked
     near = choose_nearest([line(0.08, 0.0), line(2.0, 0.0)], stops, (0.75, 0.9))
     assert near[0].stop == 2 and near[0].point[2] == 0.75 and near[1].stop == -1

@@ -11,10 +11,10 @@ from phenotype_plots import table
 from PIL import Image
 
 from jaxrl_vis import cli
-from jaxrl_vis.host.worker_pool import finite
+from jaxrl_vis.host.worker_pool import replace_non_finite
 from jaxrl_vis.stalks.cli.options import PlantOptions
 from jaxrl_vis.stalks.grasping.evaluation.records import Conditions, evaluate_run
-from jaxrl_vis.stalks.grasping.evaluation.scoring import draw_scene, score_scene, summary
+from jaxrl_vis.stalks.grasping.evaluation.scoring import draw_scene, score_scene, summarise_scores
 from jaxrl_vis.stalks.grasping.evaluation.truth_on_disk import find_truth
 from jaxrl_vis.stalks.grasping.perception.cloud import Mount
 from jaxrl_vis.stalks.grasping.perception.perceive import DEFAULT_VARIANT, THESIS_VARIANT, Variant
@@ -164,7 +164,7 @@ def test_eval_of_rows_and_of_an_empty_one(spec, tmp_path, capsys):
     assert "simulated runs of family few" in said and "the arm, again, wind 5 mm:" in said
     # A run is the same in this process, and is not evaluated again.
     family = PlantOptions(spec=spec, width=256, frames=3).read_family("grasping")
-    here = json.loads(json.dumps(finite(evaluate_run(Conditions(family), 1))))
+    here = json.loads(json.dumps(replace_non_finite(evaluate_run(Conditions(family), 1))))
     there = figures["each"][1]
     assert here["plan"]["stalks"] == there["plan"]["stalks"] and here["hits"] == there["hits"]
     np.testing.assert_allclose(here["plan"]["targets"], there["plan"]["targets"], atol=2e-6)
@@ -195,7 +195,7 @@ def test_masks_are_compared_with_the_truth_and_the_figure_is_drawn(spec, tmp_pat
     score, perception = score_scene(scene, lambda image, number: np.roll(scene.masks[number], 1, axis=1))
     assert score.mask is not None and 0.3 < score.mask.boundary < 1.5
     assert 0.6 < 2.0 * score.mask.hits / (score.mask.painted + score.mask.true) < 0.97
-    assert summary([score])["mask_f1"] < 1.0 and len(perception.clouds) == 3
+    assert summarise_scores([score])["mask_f1"] < 1.0 and len(perception.clouds) == 3
     thesis, _ = score_scene(scene, None, THESIS_VARIANT)
     assert thesis.mask is None and np.median(thesis.stitches) > np.median(score.stitches)
     mixed, _ = score_scene(scene, None, Variant(points=True))

@@ -7,7 +7,14 @@ import pytest
 from scipy.stats import binomtest
 
 from jaxrl_vis.stalks.grasping.evaluation import grasp_score
-from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Standing, match, score, thesis_ratio, wilson
+from jaxrl_vis.stalks.grasping.evaluation.grasp_score import (
+    Attempt,
+    Standing,
+    match_grasps,
+    score,
+    thesis_ratio,
+    wilson_interval,
+)
 
 
 def held(*stalks: int) -> frozenset[int]:
@@ -21,10 +28,10 @@ def stand(stalk: int, run: int = 0, reachable: bool = True, room: float = 0.02, 
 def test_wilson_is_that_of_scipy():
     for count, of in ((0, 1), (1, 1), (0, 20), (7, 20), (20, 20), (481, 500)):
         theirs = binomtest(count, of).proportion_ci(method="wilson")
-        np.testing.assert_allclose(wilson(count, of), (theirs.low, theirs.high), atol=1e-6)
-    assert all(math.isnan(each) for each in wilson(0, 0))
+        np.testing.assert_allclose(wilson_interval(count, of), (theirs.low, theirs.high), atol=1e-6)
+    assert all(math.isnan(each) for each in wilson_interval(0, 0))
     with pytest.raises(ValueError, match="3 of 2"):
-        wilson(3, 2)
+        wilson_interval(3, 2)
 
 
 @pytest.mark.parametrize(
@@ -49,8 +56,8 @@ def test_errors_that_cancel_in_the_count_are_counted_here():
     attempts = [Attempt(0, 0, held(0)), Attempt(0, 1, held()), Attempt(0, 2, held(2, 3))]
     found = score(attempts, [stand(index) for index in range(4)])
     assert thesis_ratio(attempts) == (1.0, 1) and found.thesis_ratio == 1.0
-    assert (found.of_sent.count, found.of_sent.of) == (1, 3)
-    assert (found.of_reachable.count, found.of_reachable.of) == (1, 4)
+    assert (found.of_sent.count, found.of_sent.total) == (1, 3)
+    assert (found.of_reachable.count, found.of_reachable.total) == (1, 4)
     outcomes = {each.name: each.count for each in found.outcomes}
     assert outcomes["attempts: miss"] == 1 and outcomes["attempts: several"] == 1
     stages = {each.name.removeprefix("reachable stalks: "): each.count for each in found.stages}
@@ -75,10 +82,10 @@ def test_the_ratio_of_the_thesis_is_a_mean_over_runs():
 def test_crowded_stalks_have_their_own_row_and_are_in_the_total():
     stalks = [stand(0), stand(1, room=0.004), stand(2, room=-0.01), stand(3, room=math.inf), stand(4, reachable=False)]
     found = score([Attempt(0, 0, held(0)), Attempt(0, 2, held(2, 1))], stalks)
-    assert (found.with_room.count, found.with_room.of) == (1, 2)
-    assert (found.crowded.count, found.crowded.of) == (0, 2)
-    assert (found.of_reachable.count, found.of_reachable.of) == (1, 4)
-    assert (found.of_all.count, found.of_all.of) == (1, 5)
+    assert (found.with_room.count, found.with_room.total) == (1, 2)
+    assert (found.crowded.count, found.crowded.total) == (0, 2)
+    assert (found.of_reachable.count, found.of_reachable.total) == (1, 4)
+    assert (found.of_all.count, found.of_all.total) == (1, 5)
 
 
 def test_the_failing_stage_is_the_first():
@@ -106,8 +113,8 @@ def test_what_is_refused_fails_in_every_total_and_is_no_reach():
         Attempt(0, 2, held(2), collided=True, brushed=True),
     ]
     found = score(attempts, [stand(index) for index in range(3)])
-    assert (found.of_reachable.count, found.of_reachable.of) == (2, 3) and (found.of_all.count, found.of_all.of) == (2, 3)
-    assert (found.of_sent.count, found.of_sent.of) == (2, 2) and (found.touches.count, found.touches.of) == (1, 2)
+    assert (found.of_reachable.count, found.of_reachable.total) == (2, 3) and (found.of_all.count, found.of_all.total) == (2, 3)
+    assert (found.of_sent.count, found.of_sent.total) == (2, 2) and (found.touches.count, found.touches.total) == (1, 2)
     assert {each.name: each.count for each in found.outcomes}["attempts: refused"] == 1
     assert thesis_ratio(attempts) == (1.0, 1)
 
@@ -115,7 +122,7 @@ def test_what_is_refused_fails_in_every_total_and_is_no_reach():
 def test_collisions_and_false_targets_are_told_apart_from_success():
     attempts = [Attempt(0, 0, held(0), collided=True), Attempt(0, None, held()), Attempt(0, 1, held(1), brushed=True)]
     found = score(attempts, [stand(0), stand(1)])
-    assert (found.collisions.count, found.collisions.of) == (1, 3)
+    assert (found.collisions.count, found.collisions.total) == (1, 3)
     assert (found.brushes.count, found.false_targets.count) == (1, 1)
     assert found.of_sent.count == 2
 
@@ -123,24 +130,27 @@ def test_collisions_and_false_targets_are_told_apart_from_success():
 def test_every_reachable_stalk_is_in_one_class_of_distances():
     distances = [0.0, 0.0299, 0.03, 0.064, 0.065, 0.5, math.inf]
     found = score([], [stand(index, neighbour=each) for index, each in enumerate(distances)])
-    assert [each.of for each in found.by_neighbour] == [2, 1, 0, 1, 1, 2]
-    assert found.of_reachable.of == 7
+    assert [each.total for each in found.by_neighbour] == [2, 1, 0, 1, 1, 2]
+    assert found.of_reachable.total == 7
 
 
 def test_matching_takes_one_each_and_the_least_distance():
     stalks = np.array([[0.0, 0.0], [0.05, 0.0], [1.0, 0.0]])
-    np.testing.assert_array_equal(match([[0.02, 0.0], [0.03, 0.0], [0.5, 0.0]], stalks, 0.06), [0, 1, -1])
+    np.testing.assert_array_equal(match_grasps([[0.02, 0.0], [0.03, 0.0], [0.5, 0.0]], stalks, 0.06), [0, 1, -1])
     # Two points beside one stalk: the nearer one has it.
-    np.testing.assert_array_equal(match([[0.99, 0.01], [1.0, 0.001]], stalks, 0.03), [-1, 2])
+    np.testing.assert_array_equal(match_grasps([[0.99, 0.01], [1.0, 0.001]], stalks, 0.03), [-1, 2])
     # As many pairs as there can be: the point between takes the far stalk so that the other has one, too.
-    np.testing.assert_array_equal(match([[0.02, 0.0], [-0.02, 0.0]], stalks[:2], 0.04), [1, 0])
-    assert match(np.zeros((0, 2)), stalks, 0.1).shape == (0,) and (match([[0.0, 0.0]], np.zeros((0, 2)), 0.1) == -1).all()
+    np.testing.assert_array_equal(match_grasps([[0.02, 0.0], [-0.02, 0.0]], stalks[:2], 0.04), [1, 0])
+    assert (
+        match_grasps(np.zeros((0, 2)), stalks, 0.1).shape == (0,)
+        and (match_grasps([[0.0, 0.0]], np.zeros((0, 2)), 0.1) == -1).all()
+    )
 
 
 def test_matching_takes_the_height_of_each_grasp():
     # One leaning stalk, grasped at two heights.
     stalks = np.array([[[0.0, 0.0], [0.1, 0.0]], [[0.1, 0.0], [0.2, 0.0]]])
-    np.testing.assert_array_equal(match([[0.0, 0.0], [0.2, 0.0]], stalks, 0.02), [0, 1])
+    np.testing.assert_array_equal(match_grasps([[0.0, 0.0], [0.2, 0.0]], stalks, 0.02), [0, 1])
 
 
 def test_what_does_not_belong_together_is_refused():

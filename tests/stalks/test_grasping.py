@@ -6,13 +6,13 @@ import math
 import numpy as np
 import pytest
 
-from jaxrl_vis.stalks.grasping.evaluation.scoring import RunScore, match_stalks, stitch_error, summary, true_motion
-from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, match, organise, redness, subsample
-from jaxrl_vis.stalks.grasping.perception.lines import grasp_points
+from jaxrl_vis.stalks.grasping.evaluation.scoring import RunScore, match_stalks, stitch_error, summarise_scores, true_motion
+from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, build_cloud, compute_disparity, redness, subsample
+from jaxrl_vis.stalks.grasping.perception.lines import detect_grasp_points
 from jaxrl_vis.stalks.grasping.perception.perceive import View, perceive
-from jaxrl_vis.stalks.grasping.perception.slices import slice_at, slice_points
-from jaxrl_vis.stalks.grasping.perception.stalk_segments import join_segments, stalk_segments
-from jaxrl_vis.stalks.grasping.perception.stitch import DEFAULT, THESIS, Motion, Thinned, rigid, stitch
+from jaxrl_vis.stalks.grasping.perception.slices import detect_by_slice, slice_at
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import extract_stalk_segments, join_segments
+from jaxrl_vis.stalks.grasping.perception.stitch import DEFAULT, THESIS, DownsampledCloud, Motion, fit_rigid_motion, stitch
 from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
 from jaxrl_vis_envs.plants import Calibration, Pose, draw, drive
 from jaxrl_vis_envs.plants.grasping import GRASPING, GRASPING_FAMILIES, GRASPING_SHIFTED, MIN_RANGE
@@ -80,11 +80,11 @@ def test_a_plane_is_matched_and_put_where_it_is(depth):
     disparity = round(CAMERA.focal * CAMERA.baseline / depth)
     texture = rng.integers(0, 255, (320, 320 + disparity)).astype(np.uint8)
     left, right = texture[:, :320], texture[:, disparity : disparity + 320]
-    found = match(left, right, CAMERA, MOUNT)
+    found = compute_disparity(left, right, CAMERA, MOUNT)
     assert np.isfinite(found[:, disparity + 8 :]).mean() > 0.98
     np.testing.assert_allclose(np.nanmedian(found), disparity, atol=0.1)
-    cloud = organise(found, np.zeros(found.shape, bool), CAMERA, MOUNT)
-    assert cloud.points.shape == (320, 320, 3) and len(cloud.red_points()) == 0
+    cloud = build_cloud(found, np.zeros(found.shape, bool), CAMERA, MOUNT)
+    assert cloud.points.shape == (320, 320, 3) and len(cloud.stalk_points()) == 0
     depth = CAMERA.focal * CAMERA.baseline / disparity
     # The middle of the image is that far away along a ray that points down by 15 degrees.
     expected = [0.0, depth * math.cos(math.radians(15)), 1.0 - depth * math.sin(math.radians(15))]
@@ -103,7 +103,7 @@ def test_thinning_takes_the_mean_of_each_cube():
 def test_the_rigid_motion_of_points_is_found():
     motion = turned((3.0, -5.0, 8.0), (0.1, -0.2, 0.05))
     points = np.random.default_rng(1).normal(size=(50, 3))
-    found = rigid(points, motion(points), np.ones(50))
+    found = fit_rigid_motion(points, motion(points), np.ones(50))
     np.testing.assert_allclose(found.rotation, motion.rotation, atol=1e-9)
     np.testing.assert_allclose(found.after(motion.inverse()).shift, np.zeros(3), atol=1e-9)
     assert found.angle == pytest.approx(motion.angle)
@@ -117,19 +117,19 @@ def test_odometry_and_a_narrow_gate_find_the_motion_and_the_thesis_does_not():
     here, there = (part + rng.normal(0, 0.001, part.shape) for part in (here, there))
     here, there = (part[np.abs(part[:, 0]) < 0.4] for part in (here, there))  # each pair sees its own part of the row
     place = np.array([0.0, 0.55, 0.75])
-    found = stitch(Thinned(here), Thinned(there), 0.103)
+    found = stitch(DownsampledCloud(here), DownsampledCloud(there), 0.103)
     assert not found.refused and found.overlap > 0.6 and found.residual < 0.004
     assert np.linalg.norm((found.motion(place) - motion(place))[:2]) < 0.002
-    blind = stitch(Thinned(here, THESIS), Thinned(there, THESIS), 0.103, THESIS)
+    blind = stitch(DownsampledCloud(here, THESIS), DownsampledCloud(there, THESIS), 0.103, THESIS)
     assert np.linalg.norm((blind.motion(place) - motion(place))[:2]) > 0.006
 
 
 def test_what_odometry_rules_out_is_refused():
-    whole = Thinned(thicket())
+    whole = DownsampledCloud(thicket())
     found = stitch(whole, whole, 0.2)  # odometry says that the robot moved; it did not
     assert found.refused and np.allclose(found.motion.shift, [-0.2, 0, 0])
     assert "overlap" in found.refused or "moved" in found.refused
-    assert stitch(whole, Thinned(np.zeros((0, 3))), 0.1).refused == "a cloud is empty"
+    assert stitch(whole, DownsampledCloud(np.zeros((0, 3))), 0.1).refused == "a cloud is empty"
     assert not stitch(whole, whole, 0.2, THESIS).refused
 
 
@@ -178,16 +178,16 @@ def seen(
             depth[line[inside], column[inside]] = camera[inside, 2]
     red = np.isfinite(depth)
     background = np.where(red, depth, np.float32(0.9))
-    return organise(CAMERA.disparity(background).astype(np.float32), red, CAMERA, MOUNT)
+    return build_cloud(CAMERA.disparity(background).astype(np.float32), red, CAMERA, MOUNT)
 
 
 STALKS = [(-0.25, 0.55, 0.05), (-0.13, 0.6, -0.08), (-0.05, 0.52, 0.0), (0.1, 0.57, 0.1)]
 
 
 def found_in(clouds: list[Cloud], motions: list[Motion]):
-    parts = [stalk_segments(cloud, CAMERA, MOUNT, frame) for frame, cloud in enumerate(clouds)]
+    parts = [extract_stalk_segments(cloud, CAMERA, MOUNT, frame) for frame, cloud in enumerate(clouds)]
     parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(motions, parts)]
-    return grasp_points(join_segments(parts), Visibility(tuple(clouds), tuple(motions), CAMERA, MOUNT))
+    return detect_grasp_points(join_segments(parts), Visibility(tuple(clouds), tuple(motions), CAMERA, MOUNT))
 
 
 def test_a_line_per_stalk_in_spite_of_what_hides_it():
@@ -223,9 +223,9 @@ def test_lines_bend_and_taper_as_the_stalks_do():
 
 def both(one: Cloud, other: Cloud) -> Cloud:
     """What a pair sees of what is in two clouds."""
-    depth = np.fmin(*(np.where(cloud.red, cloud.depth, np.float32(np.nan)) for cloud in (one, other)))
+    depth = np.fmin(*(np.where(cloud.mask, cloud.depth, np.float32(np.nan)) for cloud in (one, other)))
     red = np.isfinite(depth)
-    return organise(CAMERA.disparity(np.where(red, depth, np.float32(0.9))).astype(np.float32), red, CAMERA, MOUNT)
+    return build_cloud(CAMERA.disparity(np.where(red, depth, np.float32(0.9))).astype(np.float32), red, CAMERA, MOUNT)
 
 
 def test_stalks_beside_each_other_in_one_pair_are_two():
@@ -265,13 +265,13 @@ def test_slices_see_each_stalk_once_and_its_front():
         angle, height = rng.uniform(-math.pi, 0.0, 4000), rng.uniform(0.4, 1.1, 4000)
         points.append(np.stack([x + 0.007 * np.cos(angle), y + 0.007 * np.sin(angle), height], axis=1))
     points = np.concatenate(points)
-    found = slice_points(points)
+    found = detect_by_slice(points)
     assert len(found) == len(STALKS)
     for point, (x, y, _) in zip(found, STALKS):
         assert abs(point.point[0] - x) < 0.003 and -0.008 < point.point[1] - y < -0.002
     part = slice_at(points, 0.65)
     assert part.heat.shape == part.regions.shape and part.regions.max() == len(part.middles) == len(STALKS)
-    assert slice_points(np.zeros((0, 3))) == []
+    assert detect_by_slice(np.zeros((0, 3))) == []
 
 
 def test_grasp_points_are_matched_with_stalks_one_to_one():
@@ -293,11 +293,11 @@ def test_figures_of_runs():
         RunScore(0, 8, 8, np.array([1.0] * 7), np.array([0.5, 1.5]), 0, seconds, None, ()),
         RunScore(1, 2, 2, np.array([3.0, 5.0]), np.array([2.5]), 1, seconds, None, ("a note",)),
     ]
-    figures = summary(scores)
+    figures = summarise_scores(scores)
     assert figures["f1"] == pytest.approx(18 / 20) and figures["precision"] == figures["recall"] == pytest.approx(0.9)
     assert figures["point_median_mm"] == 1.0 and figures["stitch_median_mm"] == 1.5 and figures["stitches_refused"] == 1
     assert figures["seconds_per_pair"] == pytest.approx(0.3)
-    assert math.isnan(summary([])["f1"])
+    assert math.isnan(summarise_scores([])["f1"])
 
 
 # --- masks ---

@@ -288,7 +288,7 @@ def test_a_lens_that_was_not_tried_gives_no_numbers(plots, tmp_path):
     said = {}
 
     def count(tried: LensRange | None) -> str:
-        request = Request(tmp_path / "out", "strip", "truth", calibration, tried=tried)
+        request = Request(tmp_path / "out", "strip", "truth", calibration, lens_range=tried)
         (row,), _ = pipeline_run([plot], find_truth, request, echo=said.__setitem__)
         assert (row["width_mean_mm"] == "") == (row["stalks"] == "") and (row["stalks"] == "") == (row["flag"] != "ok")
         return row["flag"]

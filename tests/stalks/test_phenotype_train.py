@@ -18,8 +18,8 @@ from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.calibration import write_calibration
-from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask, outlined_mask
-from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, settings_for
+from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask, rasterise_polygons
+from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, fit_settings
 from jaxrl_vis.stalks.phenotyping.training.detector_training import OUTPUTS
 from jaxrl_vis_envs.plants import Calibration
 
@@ -231,26 +231,26 @@ def test_a_box_that_is_not_there_is_the_one_around_the_mask(tmp_path, segmentati
     for annotation in ({}, {"bbox": None}):
         (found,) = read_annotations(coco_folder(tmp_path, {"segmentation": segmentation, **annotation}))["annotations"]
         assert found["bbox"] == BOX
-    settings = settings_for(tmp_path, TINY)
+    settings = fit_settings(tmp_path, TINY)
     assert settings.band_height == 30.0 and settings.width == 48  # the image is reduced so that the box is as tall
 
 
 def test_a_calibration_gives_the_scale_of_annotated_images(tmp_path):
     """Without one, images are reduced to one width, and so are those that the networks are used on."""
     coco_folder(tmp_path, {"bbox": BOX})
-    assert settings_for(tmp_path, TINY).pixels_per_metre == 0.0
+    assert fit_settings(tmp_path, TINY).pixels_per_metre == 0.0
     usual = TINY.pixels_per_metre * 0.8
     write_calibration(tmp_path / "calibration.yaml", Calibration(IMAGE[1], IMAGE[0], 0.5 * usual, (31.5, 29.5), 0.1))
-    settings = settings_for(tmp_path, TINY)
+    settings = fit_settings(tmp_path, TINY)
     assert settings.pixels_per_metre == TINY.pixels_per_metre and settings.band_height == 80.0
     (example,) = annotated_examples(tmp_path, settings)
     assert example.image.shape == (2 * IMAGE[0], 2 * IMAGE[1], 3) and example.stalks[0, 3] == 88.0
     without = [line for line in (tmp_path / "calibration.yaml").read_text().splitlines() if not line.startswith("image_")]
     (tmp_path / "calibration.yaml").write_text("\n".join(without))  # of images that say their size themselves
-    assert settings_for(tmp_path, TINY) == settings
+    assert fit_settings(tmp_path, TINY) == settings
     write_calibration(tmp_path / "calibration.yaml", Calibration(80, 60, usual, (39.5, 29.5), 0.1))
     with pytest.raises(RequestError, match=r"row.png has 64 x 60 pixels, but the calibration is for 80 x 60"):
-        settings_for(tmp_path, TINY)
+        fit_settings(tmp_path, TINY)
 
 
 # --- masks from outlines ---
@@ -265,7 +265,7 @@ def test_masks_of_strips_are_as_wide_as_the_strips():
         top, tall = rng.uniform(5, 15), 120.0
         right = left + wide
         outline = [left, top, right, top, right + lean * tall, top + tall, left + lean * tall, top + tall]
-        runs = outlined_mask([outline], (160, 200)).sum(axis=1)[20:120]
+        runs = rasterise_polygons([outline], (160, 200)).sum(axis=1)[20:120]
         errors.append(runs.mean() - wide)
     assert abs(np.mean(errors)) < 0.02 and np.std(errors) < 0.1
 
@@ -293,8 +293,8 @@ def test_masks_of_outlines_agree_with_boxes_and_runs(tmp_path):
 def test_outlines_beyond_the_image_and_of_several_parts():
     inside = np.zeros((10, 12), bool)
     inside[:4, :5] = True
-    np.testing.assert_array_equal(outlined_mask([[-7, -3, 5, -3, 5, 4, -7, 4]], (10, 12)), inside)
+    np.testing.assert_array_equal(rasterise_polygons([[-7, -3, 5, -3, 5, 4, -7, 4]], (10, 12)), inside)
     inside[6:, 9:] = True
     parts = [[-7, -3, 5, -3, 5, 4, -7, 4], [0, 0, 3, 0, 3, 3, 0, 3], [9, 6, 30, 6, 30, 30, 9, 30]]
-    np.testing.assert_array_equal(outlined_mask(parts, (10, 12)), inside)  # parts that overlap are no holes
-    assert not outlined_mask([[20, 20, 30, 20, 30, 30]], (10, 12)).any()
+    np.testing.assert_array_equal(rasterise_polygons(parts, (10, 12)), inside)  # parts that overlap are no holes
+    assert not rasterise_polygons([[20, 20, 30, 20, 30, 30]], (10, 12)).any()

@@ -12,10 +12,10 @@ from jaxrl_vis.stalks.phenotyping.io.images import read_disparity, read_image, w
 from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, encode_mask
 from jaxrl_vis.stalks.phenotyping.measure.diameter import diameter_mm, edge_tilt
 from jaxrl_vis.stalks.phenotyping.measure.edges import refine_edges
-from jaxrl_vis.stalks.phenotyping.measure.ground import _plane, find_ground
-from jaxrl_vis.stalks.phenotyping.measure.stalk import measure
+from jaxrl_vis.stalks.phenotyping.measure.ground import _fit_plane, find_ground
+from jaxrl_vis.stalks.phenotyping.measure.stalk import measure_stalk
 from jaxrl_vis.stalks.phenotyping.measure.stereo import match_rows, match_sgbm
-from jaxrl_vis.stalks.phenotyping.measure.width import ELLIPSE_FITS, ellipse_width, strip_near, strip_width
+from jaxrl_vis.stalks.phenotyping.measure.width import ELLIPSE_FITS, ellipse_width, fit_strip, fit_strip_near
 from jaxrl_vis_envs.plants import Calibration
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,7 +58,7 @@ def test_the_widest_ellipse_counts_and_specks_do_not():
 
 def test_leaves_and_nodes_do_not_change_a_strip():
     mask = STRIPS["ideal_strip"](30.0, 10.0, 7.0, (0.0, 0.0), False)
-    clean = strip_width(mask)
+    clean = fit_strip(mask)
     disturbed = mask.copy()
     half = mask.shape[0] // 2
     for line in range(half - 60, half - 20):  # a leaf before its right half
@@ -67,7 +67,7 @@ def test_leaves_and_nodes_do_not_change_a_strip():
     for line in range(half + 30, half + 45):  # a node, 10 % thicker
         columns = np.flatnonzero(mask[line])
         disturbed[line, columns[0] - 2 : columns[0]] = disturbed[line, columns[-1] + 1 : columns[-1] + 3] = True
-    found = strip_width(disturbed)
+    found = fit_strip(disturbed)
     assert found.width() == pytest.approx(30.0, abs=0.2)
     assert found.lean == pytest.approx(np.radians(7.0), abs=0.003)
     assert found.used < clean.used - 0.1
@@ -80,13 +80,13 @@ def test_a_sheath_elsewhere_does_not_matter_where_a_width_is_taken():
     half = np.where((line >= 120) & (line < 240), 21.5, 20.0)
     mask = np.abs(np.arange(120)[None, :] - 60.3 - 0.05 * line) < half
     mask[330:] &= np.arange(120) < 75
-    strip = strip_width(mask)
+    strip = fit_strip(mask)
     across = np.cos(strip.lean)
     for place, true in ((180.0, 43.0), (60.0, 40.0), (270.0, 40.0)):
-        assert strip_near(strip, place, 45.0, 400).width(place) == pytest.approx(true * across, abs=0.3)
+        assert fit_strip_near(strip, place, 45.0, 400).width(place) == pytest.approx(true * across, abs=0.3)
     assert abs(strip.width(180.0) - 43.0) > 1.0  # as a whole, it is bare
-    assert strip_near(strip, 390.0, 50.0, 400) is None  # one edge is that of what hides the other
-    assert strip_near(strip, 600.0, 50.0, 400) is None  # beyond the mask
+    assert fit_strip_near(strip, 390.0, 50.0, 400) is None  # one edge is that of what hides the other
+    assert fit_strip_near(strip, 600.0, 50.0, 400) is None  # beyond the mask
 
 
 def blurred_stalk(left: float, right: float, texture: float = 0.0) -> np.ndarray:
@@ -102,7 +102,7 @@ def test_edges_settle_where_the_image_changes(wrong):
     """A mask that is too narrow or too wide on both sides, beside what is truly there; in a part of the image."""
     image = blurred_stalk(40.5, 79.5, 20.0)
     mask = np.zeros((160, 80), bool)
-    strip = strip_width(mask | ((np.arange(80) > 20.5) & (np.arange(80) < 59.5)))
+    strip = fit_strip(mask | ((np.arange(80) > 20.5) & (np.arange(80) < 59.5)))
     assert strip is not None
     off = dataclasses.replace(strip, left=(strip.left[0] - wrong, 0.0), right=(strip.right[0] + wrong, 0.0))
     settled = refine_edges(off, image, (20, 20), 80.0, 60.0)
@@ -113,7 +113,7 @@ def test_edges_settle_where_the_image_changes(wrong):
 def test_edges_stay_where_the_image_shows_none():
     """Nothing but noise, and a change that is too far away to be meant."""
     mask = np.zeros((160, 80), bool)
-    strip = strip_width(mask | ((np.arange(80) > 20.5) & (np.arange(80) < 59.5)))
+    strip = fit_strip(mask | ((np.arange(80) > 20.5) & (np.arange(80) < 59.5)))
     assert strip is not None
     noise = np.random.default_rng(1).normal(100.0, 10.0, (200, 120)).astype(np.float32)
     for image in (np.full((200, 120), 60.0, np.float32), blurred_stalk(28.5, 91.5)):
@@ -131,18 +131,18 @@ def test_a_width_that_was_not_seen_where_it_is_asked_for_is_a_lower_bound():
     image, known = np.full((400, 240), 90.0, np.float32), np.full((400, 240), 125.0, np.float32)
 
     def measured(line: float):
-        return measure(mask, (20, 80), image, image, cameras, line=line, disparity=known)
+        return measure_stalk(mask, (20, 80), image, image, cameras, line=line, disparity=known)
 
     seen, hidden = measured(300.0), measured(90.0)
-    assert seen.here and seen.width == pytest.approx(40.0, abs=0.1)
-    assert hidden.diameter_mm is not None and not hidden.here
+    assert seen.both_edges_visible and seen.width == pytest.approx(40.0, abs=0.1)
+    assert hidden.diameter_mm is not None and not hidden.both_edges_visible
 
 
 def test_taper_is_followed():
     line = np.arange(300)[:, None]
     half = 20.0 - 0.02 * line
     mask = np.abs(np.arange(120)[None, :] - 60.3 - 0.05 * line) < half
-    strip = strip_width(mask)
+    strip = fit_strip(mask)
     for where in (50, 150, 250):
         expected = 2 * (20.0 - 0.02 * where) * np.cos(strip.lean)
         assert strip.width(where) == pytest.approx(expected, rel=0.005)
@@ -151,7 +151,7 @@ def test_taper_is_followed():
 
 @pytest.mark.parametrize("mask", [np.zeros((60, 40), bool), np.ones((60, 40), bool), np.eye(5, dtype=bool)])
 def test_what_is_no_strip_has_no_width(mask):
-    assert strip_width(mask) is None
+    assert fit_strip(mask) is None
 
 
 # --- millimetres ---
@@ -238,7 +238,7 @@ def test_a_ground_that_is_mostly_hidden_is_found():
         inverse = rng.uniform(0.4, 2.0, 700)
         seen = np.flatnonzero(rays[:, 1] > 0.25)[:70]
         inverse[seen] = rays[seen] @ true + rng.normal(0.0, 1e-3, len(seen))
-        found = _plane(rays, inverse, 6e-3)
+        found = _fit_plane(rays, inverse, 6e-3)
         assert found is not None
         np.testing.assert_allclose(found, true, atol=0.03)
 

@@ -12,7 +12,7 @@ from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, Patterns, PlotFolder, find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image
-from jaxrl_vis.stalks.phenotyping.io.naming.stamps import nearest, seconds_in
+from jaxrl_vis.stalks.phenotyping.io.naming.stamps import match_nearest, parse_timestamp
 from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read_odometry
 
 
@@ -158,8 +158,8 @@ def test_images_are_paired_by_the_nearest_times(gaps, shift, unit):
     """Whatever the intervals, a small common shift leaves every image with its own partner."""
     left = {str(place): sum(gaps[: place + 1]) * 0.01 for place in range(len(gaps))}
     right = {f"r{name}": time + shift * 1e-9 * unit for name, time in left.items()}
-    assert nearest(left, right) == {name: f"r{name}" for name in left}
-    assert nearest(left, {}) == {}
+    assert match_nearest(left, right) == {name: f"r{name}" for name in left}
+    assert match_nearest(left, {}) == {}
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_images_are_paired_by_the_nearest_times(gaps, shift, unit):
     ],
 )
 def test_times_in_names(stem, seconds):
-    assert seconds_in(stem) == (None if seconds is None else pytest.approx(seconds, abs=1e-6))
+    assert parse_timestamp(stem) == (None if seconds is None else pytest.approx(seconds, abs=1e-6))
 
 
 # --- odometry ---

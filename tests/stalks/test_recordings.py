@@ -11,7 +11,7 @@ from jaxrl_vis.stalks.phenotyping.io import recording
 from jaxrl_vis.stalks.phenotyping.io.calibration import find_calibration, read_calibration
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import read_image
-from jaxrl_vis.stalks.phenotyping.io.recording import Topics, is_recording, take_apart
+from jaxrl_vis.stalks.phenotyping.io.recording import Topics, extract_recording, is_recording
 from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometry
 
 SIZE = (24, 32)
@@ -24,7 +24,7 @@ def test_without_rosbags_its_installation_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(recording.importlib.util, "find_spec", lambda name: None)
     assert is_recording(tmp_path / "a.bag") and not is_recording(tmp_path)
     with pytest.raises(RequestError, match=r"to read it needs rosbags: .*install .*bags"):
-        take_apart(tmp_path / "a.bag", tmp_path / "out")
+        extract_recording(tmp_path / "a.bag", tmp_path / "out")
 
 
 def write(
@@ -120,7 +120,7 @@ def test_a_recording_is_a_plot(tmp_path, name, version, storage):
     path = write(tmp_path / name, version, storage=storage)
     assert is_recording(path)
     for found in {path, *path.glob("*.mcap"), *path.glob("*.db3")} if path.is_dir() else {path}:
-        folder = take_apart(found, tmp_path / "out")
+        folder = extract_recording(found, tmp_path / "out")
         (plot,) = find_plots(folder)
         assert plot.name == found.stem and len(plot.pairs) == FRAMES
         for pair, both in zip(plot.pairs, PLAIN):
@@ -134,12 +134,12 @@ def test_a_recording_is_a_plot(tmp_path, name, version, storage):
         assert driven is not None
         np.testing.assert_allclose(list(driven.values()), [0.075, 0.175, 0.275], atol=1e-4)
         before = (folder / "left.yaml").stat().st_mtime_ns
-        assert take_apart(found, tmp_path / "out") == folder and (folder / "left.yaml").stat().st_mtime_ns == before
+        assert extract_recording(found, tmp_path / "out") == folder and (folder / "left.yaml").stat().st_mtime_ns == before
 
 
 @pytest.mark.parametrize("encoding", ["bgr8", "mono8", "mono16", "png", "jpeg", "bayer_rggb8"])
 def test_images_of_every_encoding(tmp_path, encoding):
-    folder = take_apart(write(tmp_path / "row.bag", 1, encoding), tmp_path)
+    folder = extract_recording(write(tmp_path / "row.bag", 1, encoding), tmp_path)
     image = read_image(next(iter(sorted((folder / "left").iterdir()))))
     wanted = {"mono8": PLAIN[0, 0, ..., 0], "mono16": PLAIN[0, 0, ..., 0].astype(np.uint16) * 200}.get(encoding, PLAIN[0, 0])
     if encoding in ("jpeg", "bayer_rggb8"):
@@ -151,19 +151,19 @@ def test_images_of_every_encoding(tmp_path, encoding):
 def test_raw_images_and_several_pairs_are_told(tmp_path):
     raw = ("/left/image_raw", "/right/image_raw")
     with pytest.raises(RequestError, match="/left/image_raw has raw images, which its camera_info says are distorted"):
-        take_apart(write(tmp_path / "raw.bag", 1, topics=raw, distortion=0.1), tmp_path)
-    assert take_apart(write(tmp_path / "straight.bag", 1, topics=raw), tmp_path).is_dir()
+        extract_recording(write(tmp_path / "raw.bag", 1, topics=raw, distortion=0.1), tmp_path)
+    assert extract_recording(write(tmp_path / "straight.bag", 1, topics=raw), tmp_path).is_dir()
     four = ("/a/left/image_rect", "/a/right/image_rect", "/b/left/image_rect", "/b/right/image_rect")
     with pytest.raises(
         RequestError, match="several pairs of images: say --left TOPIC --right TOPIC; images are on /a/left/image"
     ):
-        take_apart(_two_rigs(tmp_path / "two.bag", four), tmp_path)
-    assert take_apart(tmp_path / "two.bag", tmp_path, Topics(*four[2:])).is_dir()
+        extract_recording(_two_rigs(tmp_path / "two.bag", four), tmp_path)
+    assert extract_recording(tmp_path / "two.bag", tmp_path, Topics(*four[2:])).is_dir()
     with pytest.raises(RequestError, match="has no images on /none"):
-        take_apart(tmp_path / "two.bag", tmp_path, Topics("/none", four[1]))
+        extract_recording(tmp_path / "two.bag", tmp_path, Topics("/none", four[1]))
     mono = ("/camera/image_rect", "/other/image_rect")
     with pytest.raises(RequestError, match="no pair of left and right images"):
-        take_apart(write(tmp_path / "mono.bag", 1, topics=mono), tmp_path)
+        extract_recording(write(tmp_path / "mono.bag", 1, topics=mono), tmp_path)
 
 
 def _two_rigs(path: Path, topics: tuple[str, ...]) -> Path:
@@ -177,7 +177,7 @@ def _two_rigs(path: Path, topics: tuple[str, ...]) -> Path:
 
 def test_encodings_that_cannot_be_read_are_told(tmp_path):
     with pytest.raises(RequestError, match="images are encoded as yuv422; mono8"):
-        take_apart(write(tmp_path / "row.bag", 1, "yuv422"), tmp_path)
+        extract_recording(write(tmp_path / "row.bag", 1, "yuv422"), tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["cut", "spoilt", "empty", "text"])
@@ -194,5 +194,5 @@ def test_files_that_are_no_recordings_are_told_in_one_line(tmp_path, name, kind)
     }
     (tmp_path / name).write_bytes(data[kind])
     with pytest.raises(RequestError) as error:
-        take_apart(tmp_path / name, tmp_path / "out")
+        extract_recording(tmp_path / name, tmp_path / "out")
     assert len(str(error.value).splitlines()) == 1 and name in str(error.value)

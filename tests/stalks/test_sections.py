@@ -12,7 +12,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.anchors import encode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import roi_align, strip_half_width
 from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, covered, cut_chain, link
-from jaxrl_vis.stalks.phenotyping.detector.detect import GRID, Settings, detect, init_detector, region_features
+from jaxrl_vis.stalks.phenotyping.detector.detect import GRID, Settings, detect, init_detector, pool_regions
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, cut_to_band
 from jaxrl_vis.stalks.phenotyping.detector.sections import (
@@ -26,10 +26,10 @@ from jaxrl_vis.stalks.phenotyping.detector.sections import (
 )
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_lines
-from jaxrl_vis.stalks.phenotyping.training.augment import move
+from jaxrl_vis.stalks.phenotyping.training.augment import augment_geometry
 from jaxrl_vis.stalks.phenotyping.training.detector_training import OUTPUTS, start_sections
 from jaxrl_vis.stalks.phenotyping.training.edges import _sides, annotated_edges, stack_edges, synthetic_edges
-from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out, synthetic_examples
+from jaxrl_vis.stalks.phenotyping.training.examples import Example, crop_randomly, synthetic_examples
 from jaxrl_vis.stalks.phenotyping.training.held_out import true_targets
 from jaxrl_vis_envs.plants import Calibration, draw, family
 from jaxrl_vis_envs.plants.cameras import drive
@@ -108,7 +108,7 @@ def test_edges_move_with_the_image():
     batch, kinds = stack_edges([(edges, np.array([STALK, STALK]))] * 12, HEIGHT)
     sizes = np.tile([HEIGHT, WIDTH], (12, 1)).astype(np.int32)
     images = np.tile(image[None], (12, 1, 1, 1))
-    moved, after, _ = jax.jit(move)(images, batch, kinds, sizes, jax.random.key(4))
+    moved, after, _ = jax.jit(augment_geometry)(images, batch, kinds, sizes, jax.random.key(4))
     moved, after = np.asarray(moved)[..., 0], np.asarray(after)
     assert np.abs(after - batch).max() > 10.0
     checked = 0
@@ -133,7 +133,7 @@ def test_crops_begin_between_rows_of_the_edges():
     stalks = np.zeros((1, 6), np.float32)
     example = Example(image, stalks, np.array([NOTHING]), nothing, nothing, edges)
     for seed in range(5):
-        part = cut_out(example, (64, 80), np.random.default_rng(seed))
+        part = crop_randomly(example, (64, 80), np.random.default_rng(seed))
         assert part.edges is not None
         top, left = (int(value) for value in part.image[0, 0, :2])
         assert top % 8 == 0
@@ -155,7 +155,7 @@ def test_features_of_sections_are_those_of_roi_align():
     features = jax.random.normal(jax.random.key(0), (HEIGHT // 8, WIDTH // 4, 3))
     stalks, _ = sections_of(*(straight(25 * place - 10, 0.3 - 0.1 * place, 6 + 3 * place) for place in range(7)))
     stalks = jnp.asarray(stalks.reshape(-1, 6))
-    made = jax.jit(region_features, static_argnums=2)(features, stalks, 32)
+    made = jax.jit(pool_regions, static_argnums=2)(features, stalks, 32)
     tall, slope = 32.0, (stalks[:, 5] - stalks[:, 4]) / 32.0
     half, middle = 1.5 * strip_half_width(stalks) + 6.0, 0.5 * (stalks[:, 4] + stalks[:, 5])
     boxes = jnp.stack([middle - half, stalks[:, 1] - tall, middle + half, stalks[:, 3] + tall], axis=-1)
@@ -309,7 +309,7 @@ def test_weights_say_whether_they_detect_sections(tmp_path):
     assert set((found.stalks[found.valid][:, 3] - found.stalks[found.valid][:, 1]).tolist()) == {32.0}
     finder = Finder(params, every)
     image = np.random.default_rng(0).integers(0, 255, (64, 64, 3)).astype(np.uint8)
-    anywhere, scores, _ = finder.look(image, None)
-    inside, _, _ = finder.look(image, every.pixels_per_metre, lambda column: (9.5, 49.5))
+    anywhere, scores, _ = finder.detect_boxes(image, None)
+    inside, _, _ = finder.detect_boxes(image, every.pixels_per_metre, lambda column: (9.5, 49.5))
     assert len(anywhere) == len(scores) > 0 and len(inside) > 0
     assert set(anywhere[:, 1].tolist()) <= {0.0, 32.0} and (inside[:, [1, 3]] == [10.0, 50.0]).all()

@@ -9,13 +9,13 @@ import pytest
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
-from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, average_precision, match, summary
+from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, average_precision, match_detections, summarise_scores
 from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean_widths
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read_odometries, read_odometry
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement
-from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
-from jaxrl_vis.stalks.phenotyping.track.follow import Track, follow
+from jaxrl_vis.stalks.phenotyping.track.direction import track_either_way
+from jaxrl_vis.stalks.phenotyping.track.follow import Track, track_stalks
 from jaxrl_vis.stalks.phenotyping.track.heights import USUAL_TAPER, robust_width, stalk_widths
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, _occluded_edges
 from jaxrl_vis_envs.plants import Calibration
@@ -129,7 +129,7 @@ STALKS = [(0.02, 0.8), (0.045, 0.82), (0.3, 0.79), (0.33, 0.8), (0.7, 0.81), (1.
 @pytest.mark.parametrize("scale", [1.0, 1.03, 0.97])
 def test_stalks_are_counted_once_although_odometry_is_wrong(scale):
     frames, distances = drive(STALKS, scale=scale)
-    tracks, path = follow(frames, distances, CAMERAS)
+    tracks, path = track_stalks(frames, distances, CAMERAS)
     counted = [track for track in tracks if track.counted]
     assert len(counted) == len(STALKS)
     places = np.array([track.position_m for track in counted]) + 0.05
@@ -139,7 +139,7 @@ def test_stalks_are_counted_once_although_odometry_is_wrong(scale):
 
 def test_a_robot_that_drives_backwards_sees_the_same():
     frames, distances = drive(STALKS)
-    tracks, path = follow(frames[::-1], distances[::-1], CAMERAS)
+    tracks, path = track_stalks(frames[::-1], distances[::-1], CAMERAS)
     counted = [track for track in tracks if track.counted]
     assert len(counted) == len(STALKS) and path.length == pytest.approx(2.0, rel=0.02)
     assert counted[0].position_m > counted[-1].position_m
@@ -147,44 +147,44 @@ def test_a_robot_that_drives_backwards_sees_the_same():
 
 def test_cameras_may_move_to_their_left_while_distances_grow():
     frames, distances = drive(STALKS)
-    found = follow_either_way(frames[::-1], distances, CAMERAS)
+    found = track_either_way(frames[::-1], distances, CAMERAS)
     counted = [track for track in found.tracks if track.counted]
-    assert found.fits and len(counted) == len(STALKS) and found.path.length == pytest.approx(2.0, rel=0.02)
+    assert found.is_consistent and len(counted) == len(STALKS) and found.path.length == pytest.approx(2.0, rel=0.02)
     places = [track.position_m for track in counted]
     assert places == sorted(places)
     np.testing.assert_allclose(places, [1.95 - x for x, _ in STALKS[::-1]], atol=0.03)
     # What fits as it is given stays as it is.
-    plain = follow(frames, distances, CAMERAS)
-    same = follow_either_way(frames, distances, CAMERAS)
-    assert same.fits and same.tracks == plain[0] and np.array_equal(same.path.places, plain[1].places)
+    plain = track_stalks(frames, distances, CAMERAS)
+    same = track_either_way(frames, distances, CAMERAS)
+    assert same.is_consistent and same.tracks == plain[0] and np.array_equal(same.path.positions, plain[1].positions)
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.5, 2.0, 100.0, -100.0])
 def test_odometry_in_another_unit_does_not_fit(scale):
     frames, distances = drive(STALKS)
-    assert not follow_either_way(frames, scale * distances, CAMERAS).fits
+    assert not track_either_way(frames, scale * distances, CAMERAS).is_consistent
 
 
 def test_images_that_share_nothing_contradict_nothing():
     """A pair every 1.3 m, of 1.2 m each."""
     rng = np.random.default_rng(0)
     frames = [[sighting(x) for x in rng.uniform(-0.6, 0.6, 16)] for _ in range(6)]
-    assert follow_either_way(frames, 1.3 * np.arange(6), CAMERAS).fits
-    assert follow_either_way([], np.zeros(0), CAMERAS).fits
+    assert track_either_way(frames, 1.3 * np.arange(6), CAMERAS).is_consistent
+    assert track_either_way([], np.zeros(0), CAMERAS).is_consistent
 
 
 def test_stalks_that_are_missed_in_some_pairs_stay_one():
     frames, distances = drive(STALKS)
     rng = np.random.default_rng(3)
     frames = [[each for each in frame if rng.random() < 0.7] for frame in frames]
-    tracks, _ = follow(frames, distances, CAMERAS)
+    tracks, _ = track_stalks(frames, distances, CAMERAS)
     assert sum(track.counted for track in tracks) == len(STALKS)
 
 
 def test_what_few_pairs_show_is_no_stalk_and_ends_are_ends():
     frames, distances = drive([*STALKS, (2.3, 0.8)])
     frames[8].append(sighting(0.05))  # a leaf, once
-    tracks, _ = follow(frames, distances, CAMERAS)
+    tracks, _ = track_stalks(frames, distances, CAMERAS)
     assert sum(track.counted for track in tracks) == len(STALKS)
     reasons = " ".join(track.reason for track in tracks)
     assert "seen in 1 of" in reasons and "beyond the ends" in reasons
@@ -192,11 +192,11 @@ def test_what_few_pairs_show_is_no_stalk_and_ends_are_ends():
 
 def test_two_finds_of_one_stalk_are_one_and_neighbours_that_touch_are_two():
     frames, distances = drive([*STALKS, (0.7145, 0.81)])
-    assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == len(STALKS) + 1
+    assert sum(track.counted for track in track_stalks(frames, distances, CAMERAS)[0]) == len(STALKS) + 1
     for frame in frames:
         again = [dataclasses.replace(each, along_m=each.along_m + 0.003, score=0.6) for each in frame[:3]]  # pyright: ignore
         frame += again
-    assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == len(STALKS) + 1
+    assert sum(track.counted for track in track_stalks(frames, distances, CAMERAS)[0]) == len(STALKS) + 1
 
 
 def test_a_sighting_without_disparity_still_says_where_its_stalk_is():
@@ -205,17 +205,17 @@ def test_a_sighting_without_disparity_still_says_where_its_stalk_is():
         for place, each in enumerate(frame):
             if place % 3 == 1:
                 frame[place] = dataclasses.replace(each, diameter_mm=None, depth_m=None, along_m=None, reason="unclear")
-    tracks, _ = follow(frames, distances, CAMERAS)
+    tracks, _ = track_stalks(frames, distances, CAMERAS)
     assert sum(track.counted for track in tracks) == len(STALKS)
 
 
 def test_a_stalk_that_leans_out_of_the_plot_stands_in_it():
     """Its foot counts: 40 mm inside where it was measured at 12 inches, 13 mm beyond the end."""
     frames, distances = drive([*STALKS, (2.04, 0.8)])
-    assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == len(STALKS)
+    assert sum(track.counted for track in track_stalks(frames, distances, CAMERAS)[0]) == len(STALKS)
     for lean, more in ((10.0, 1), (-10.0, 0)):
         leaning = [[dataclasses.replace(each, height_m=0.3048, lean_deg=lean) for each in frame] for frame in frames]
-        counted = [track for track in follow(leaning, distances, CAMERAS)[0] if track.counted]
+        counted = [track for track in track_stalks(leaning, distances, CAMERAS)[0] if track.counted]
         assert any(track.position_m > 1.97 for track in counted) == bool(more)
 
 
@@ -225,16 +225,16 @@ def test_a_stalk_whose_depth_went_astray_is_no_other_one():
     for frame in frames[3:7]:
         each, far = frame[0], 0.86
         frame[0] = dataclasses.replace(each, depth_m=far, along_m=each.column / 1000.0 * far - 0.05)
-    tracks, _ = follow(frames, distances, CAMERAS)
+    tracks, _ = track_stalks(frames, distances, CAMERAS)
     assert sum(track.counted for track in tracks) == 2
     # One that does stand behind is seen beside it as the cameras move on.
     frames, distances = drive([(0.6, 0.8), (1.4, 0.8), (0.6, 0.88)])
-    assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == 3
+    assert sum(track.counted for track in track_stalks(frames, distances, CAMERAS)[0]) == 3
 
 
 def test_what_stands_before_the_row_or_has_no_place_counts_less():
     frames, distances = drive([*STALKS, (1.0, 0.55)])
-    tracks, _ = follow(frames, distances, CAMERAS)
+    tracks, _ = track_stalks(frames, distances, CAMERAS)
     assert sum(track.counted for track in tracks) == len(STALKS)
     assert any("before the row" in track.reason for track in tracks)
     for count, more in ((5, 0), (9, 1)):  # of the 14 pairs that have it in view
@@ -244,12 +244,12 @@ def test_what_stands_before_the_row_or_has_no_place_counts_less():
                 each = frame.pop(place)
                 if 4 <= number < 4 + count:
                     frame.append(dataclasses.replace(each, diameter_mm=None, depth_m=None, along_m=None, reason="unclear"))
-        assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == len(STALKS) + more
+        assert sum(track.counted for track in track_stalks(frames, distances, CAMERAS)[0]) == len(STALKS) + more
 
 
 def test_no_pairs_and_empty_fields():
-    assert follow([], np.zeros(0), CAMERAS)[0] == []
-    tracks, path = follow([[], []], np.array([0.0, 0.1]), CAMERAS)
+    assert track_stalks([], np.zeros(0), CAMERAS)[0] == []
+    tracks, path = track_stalks([[], []], np.array([0.0, 0.1]), CAMERAS)
     assert tracks == [] and path.length == pytest.approx(0.2)
 
 
@@ -347,7 +347,7 @@ def test_finds_are_matched_as_coco_matches_them():
         return Detection((left, 0.0, left + 40.0, 500.0), (left, left), score, np.zeros((1, 1)), (0, 0))
 
     finds = [find(2.0, 0.6), find(1.0, 0.9), find(101.0, 0.8), find(300.0, 0.7)]
-    owners, scored = match(finds, [clear, occluded])
+    owners, scored = match_detections(finds, [clear, occluded])
     assert owners == [None, 4, 5, None]
     assert sorted(scored) == [(0.6, 0.0), (0.7, 0.0), (0.9, 1.0)]
 
@@ -368,14 +368,14 @@ def test_average_precision_and_the_figures_of_plots():
         ),
         PlotScore(1, 40, 41, np.zeros((0, 2)), np.zeros((0, 2)), 1),
     ]
-    figures = summary(scores)
+    figures = summarise_scores(scores)
     assert figures["count_r2"] == pytest.approx(1.0 - 2.0 / 50.0) and figures["count_mae"] == 1.0
     assert figures["width_mae_mm"] == pytest.approx(0.75) and figures["width_bias_mm"] == pytest.approx(0.25)
     assert figures["width_coverage_95"] == 0.5  # 1 mm beside, of 0.98, and 0.5 of 0.59
     assert figures["precision"] == 1.0 and figures["recall"] == pytest.approx(1 / 3)
     # Both finds, of scores .9 and .2, are right; one stalk of three is found by none.
     assert figures["f1_best"] == pytest.approx(0.8) and figures["f1_best_least_score"] == 0.2
-    assert np.isnan(summary([])["f1"])
+    assert np.isnan(summarise_scores([])["f1"])
 
 
 def test_the_thesis_counts_by_length_and_takes_means():

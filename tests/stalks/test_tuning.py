@@ -16,11 +16,11 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import init_detector, padded_s
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.sections import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
-from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, settings_for
-from jaxrl_vis.stalks.phenotyping.training.detector_training import OUTPUTS, beginning, image_batch, update_networks
-from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out, resize_crops
-from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, match_finds, score
-from jaxrl_vis.stalks.phenotyping.training.photographs import photographs_of, split
+from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, fit_settings
+from jaxrl_vis.stalks.phenotyping.training.detector_training import OUTPUTS, batch_images, init_state, update_networks
+from jaxrl_vis.stalks.phenotyping.training.examples import Example, crop_randomly, resize_crops
+from jaxrl_vis.stalks.phenotyping.training.held_out import ImageDetections, match_to_annotations, score_detections
+from jaxrl_vis.stalks.phenotyping.training.photographs import group_by_photograph, split_images
 from jaxrl_vis.stalks.phenotyping.training.tuning import FROZEN, Tuning, tune
 
 SETTINGS = dataclasses.replace(TINY, pixels_per_metre=0.0)
@@ -61,12 +61,12 @@ def params() -> dict:
 @pytest.fixture(scope="module")
 def tuned(folder, params):
     """A training that cannot become better, as its rate is 0."""
-    settings = dataclasses.replace(settings_for(folder, SETTINGS), anchor_widths=TINY.anchor_widths)
+    settings = dataclasses.replace(fit_settings(folder, SETTINGS), anchor_widths=TINY.anchor_widths)
     examples = list(annotated_examples(folder, settings))
     names = [f"{number}.png" for number in range(8)]
-    parts = split(photographs_of(names, [example.image for example in examples]), 0)
+    parts = split_images(group_by_photograph(names, [example.image for example in examples]), 0)
     lines: list[str] = []
-    plan = Tuning(steps=50, minutes=None, batch=4, crops=4, rate=0.0, look=1, patience=3)
+    plan = Tuning(steps=50, minutes=None, batch=4, crops=4, rate=0.0, evaluation_interval=1, patience=3)
     return parts, lines, tune(examples, parts, settings, plan, params, lines.append)
 
 
@@ -74,20 +74,20 @@ def test_copies_of_a_photograph_are_one(folder):
     rng = np.random.default_rng(1)
     one, other = (cv2.resize(rng.integers(0, 255, (9, 9, 3)).astype(np.uint8), (90, 70)) for _ in range(2))
     darker = np.round(0.6 * one).astype(np.uint8)
-    numbers = photographs_of(["a.jpg", "b.jpg", "c.jpg", "d.jpg"], [one, darker, one[:, ::-1], other])
+    numbers = group_by_photograph(["a.jpg", "b.jpg", "c.jpg", "d.jpg"], [one, darker, one[:, ::-1], other])
     assert numbers[0] == numbers[1] == numbers[2] != numbers[3]
     names = ["row_1_jpg.rf.0a1b2c3d4e.jpg", "row_1_jpg.rf.ffffffffff.jpg", "row_2_jpg.rf.0a1b2c3d4e.jpg"]
     images = [cv2.resize(rng.integers(0, 255, (9, 9, 3)).astype(np.uint8), (90, 70)) for _ in range(3)]
-    assert photographs_of(names, images).tolist() == [0, 0, 2]
+    assert group_by_photograph(names, images).tolist() == [0, 0, 2]
 
 
 def test_no_photograph_is_on_two_sides_of_a_split():
     photographs = np.repeat(np.arange(20), 3)
-    parts = split(photographs, 4)
+    parts = split_images(photographs, 4)
     sides = [{int(photographs[place]) for place in part} for part in (parts.train, parts.stop, parts.test)]
     assert [len(side) for side in sides] == [13, 3, 4] and len(set.union(*sides)) == 20
-    assert split(photographs, 4) == parts != split(photographs, 5)
-    few = split(np.array([0, 1, 2, 3, 3]), 0)
+    assert split_images(photographs, 4) == parts != split_images(photographs, 5)
+    few = split_images(np.array([0, 1, 2, 3, 3]), 0)
     assert few.train == (0, 1, 2, 3, 4) and not few.stop and not few.test
 
 
@@ -98,14 +98,14 @@ def test_scores_of_finds():
         [[1, 0, 11, 100, 6, 6], [0, 0, 10, 100, 5, 5], [80, 0, 90, 100, 85, 85], [20, 0, 30, 100, 25, 25]], np.float32
     )
     scores = np.array([0.9, 0.8, 0.95, 0.3])
-    right, ignored = match_finds(stalks, scores, truth, kinds)
+    right, ignored = match_to_annotations(stalks, scores, truth, kinds)
     assert right.tolist() == [True, False, False, False] and ignored.tolist() == [False, False, True, False]
-    result = score([Finds(stalks, scores, right, ignored, 2)])
+    result = score_detections([ImageDetections(stalks, scores, right, ignored, 2)])
     assert (result.finds, result.right, result.labels) == (2, 1, 2)
     assert result.precision == result.recall == result.f1 == 0.5
     assert result.soft == pytest.approx(2 * 0.9 / (0.9 + 0.8 + 0.3 + 2))
     # As good with a higher threshold; F1 does not see that the wrong one became less sure.
-    better = score([Finds(stalks, np.array([0.9, 0.6, 0.95, 0.1]), right, ignored, 2)])
+    better = score_detections([ImageDetections(stalks, np.array([0.9, 0.6, 0.95, 0.1]), right, ignored, 2)])
     assert better.f1 == result.f1 and better.soft > result.soft
 
 
@@ -113,7 +113,7 @@ def test_training_ends_where_held_out_images_do_not_become_better(tuned):
     parts, lines, result = tuned
     assert parts.photographs == 7 and {0, 7} <= {*parts.train} | {*parts.stop} | {*parts.test}
     assert any({0, 7} <= set(part) for part in (parts.train, parts.stop, parts.test))
-    assert result.made == 3 and result.steps == 0 and "has not become better" in result.why
+    assert result.updates == 3 and result.best_step == 0 and "has not become better" in result.stop_reason
     assert len(result.before) == len(result.after) == len(parts.test)
     said = [line for line in lines if not line.endswith(" s")]  # but for signs of life of what takes long
     assert said[0].startswith("compiling") and said[0].endswith("...") and "--minutes count from here" in said[1]
@@ -142,12 +142,12 @@ def test_first_layers_stay_and_a_report_shows_held_out_images(folder, params, tm
 
 
 def test_frozen_layers_do_not_decay(folder, params):
-    settings = dataclasses.replace(settings_for(folder, SETTINGS), anchor_widths=TINY.anchor_widths)
+    settings = dataclasses.replace(fit_settings(folder, SETTINGS), anchor_widths=TINY.anchor_widths)
     (example,) = itertools.islice(annotated_examples(folder, settings), 1)
-    batch = image_batch([example] * 4, padded_shape(IMAGE)), None
+    batch = batch_images([example] * 4, padded_shape(IMAGE)), None
     rates = np.float32(0.5), np.float32(0.0)
     state, parts = update_networks(
-        beginning(params), batch, jax.random.key(0), rates, settings, np.float32, (*FROZEN, "segmenter")
+        init_state(params), batch, jax.random.key(0), rates, settings, np.float32, (*FROZEN, "segmenter")
     )
     changes = differences(params, state[0])
     held = {
@@ -165,7 +165,7 @@ def differences(before: dict, after: dict) -> dict[str, float]:
 
 
 def test_images_are_resized_so_that_boxes_are_as_tall_as_the_band(folder):
-    settings = settings_for(folder, dataclasses.replace(SETTINGS, band_height=60.0))
+    settings = fit_settings(folder, dataclasses.replace(SETTINGS, band_height=60.0))
     assert settings.width == 2 * IMAGE[1] and settings.band_height == 60.0 and settings.full_width == 2 * IMAGE[1]
     example = next(iter(annotated_examples(folder, settings)))
     assert example.image.shape == (2 * IMAGE[0], 2 * IMAGE[1], 3) and example.stalks[0, 3] == 90.0
@@ -178,7 +178,7 @@ def test_cut_examples_keep_the_stalks_that_show():
         image, stalks, np.array([STALK, STALK, NOTHING]), np.zeros((2, 40, 16, 3), np.uint8), np.ones((2, 40, 16), bool)
     )
     for seed in range(20):
-        cut = cut_out(example, (100, 60), np.random.default_rng(seed))
+        cut = crop_randomly(example, (100, 60), np.random.default_rng(seed))
         assert cut.image.shape == (100, 60, 3)
         left = int(np.flatnonzero((image[0, :, 0] == cut.image[0, 0, 0]) & (image[0, :, 1] == cut.image[0, 0, 1]))[0])
         shown = [box[0] < left + 57 and box[2] > left + 3 for box in stalks[:2]]

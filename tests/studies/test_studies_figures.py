@@ -16,13 +16,13 @@ from jaxrl_vis.host.spreadsheets import to_csv
 from jaxrl_vis.run.storage.folder import SCHEMA
 from jaxrl_vis.studies import indicator
 from jaxrl_vis.studies.engine.cells import Cell, contradiction, is_finished
-from jaxrl_vis.studies.engine.results import Line, Reached, mean_weight, reached
+from jaxrl_vis.studies.engine.results import Line, StepsToLevel, find_steps, mean_weight
 from jaxrl_vis.studies.engine.study import Scope, make_cells
 from jaxrl_vis.studies.figures import indicator_figures
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
 from jaxrl_vis.studies.figures.make import make_figure
 from jaxrl_vis.studies.figures.show import Request
-from jaxrl_vis.studies.figures.tables import Named, steps_table, weights_table
+from jaxrl_vis.studies.figures.tables import LabelledLine, steps_table, weights_table
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, LEVELS, STUDIES, VARIANTS
 from jaxrl_vis_envs import registry
 
@@ -148,18 +148,18 @@ def line(values: list[list[float]], task: str = FETCH, variant: str = "ol_aux_5"
 
 
 def test_levels_are_reached_by_the_rule_of_three() -> None:
-    result = reached(line([[0.1, 0.6, 0.4, 0.6, 0.7, 0.8]] * 3), 0.5)
-    assert result == Reached(0.5, 80_000, 80_000.0, 80_000.0, 120_000) and str(result) == "80 k (80 k to 80 k)"
+    result = find_steps(line([[0.1, 0.6, 0.4, 0.6, 0.7, 0.8]] * 3), 0.5)
+    assert result == StepsToLevel(0.5, 80_000, 80_000.0, 80_000.0, 120_000) and str(result) == "80 k (80 k to 80 k)"
     # The last two evaluations have nothing after them.
-    assert str(reached(line([[0.1, 0.1, 0.1, 0.1, 0.9, 0.9]]), 0.5)) == "> 120 k"
-    one_never = reached(line([[0.9] * 6, [0.1, 0.9, 0.9, 0.9, 0.9, 0.9], [0.1] * 6]), 0.5)
+    assert str(find_steps(line([[0.1, 0.1, 0.1, 0.1, 0.9, 0.9]]), 0.5)) == "> 120 k"
+    one_never = find_steps(line([[0.9] * 6, [0.1, 0.9, 0.9, 0.9, 0.9, 0.9], [0.1] * 6]), 0.5)
     # Of three seeds the middle one counts, and one that never gets there is not averaged with the others.
     assert (one_never.steps, one_never.low, one_never.high) == (40_000, 20_000.0, None)
     assert str(one_never) == "40 k (20 k to > 120 k)"
 
 
 def test_ratios_are_numbers_or_bounds() -> None:
-    fast, slow, never = (Reached(0.5, steps, None, None, 250_000) for steps in (50_000, 100_000, None))
+    fast, slow, never = (StepsToLevel(0.5, steps, None, None, 250_000) for steps in (50_000, 100_000, None))
     assert [fast.ratio(slow), fast.ratio(never), never.ratio(slow), never.ratio(never)] == ["2.0", "> 5.0", "< 0.4", "–"]
 
 
@@ -167,10 +167,10 @@ def test_the_table_compares_with_the_baseline_of_the_same_source() -> None:
     ramp = [0.1 * place for place in range(1, 11)]
     twice = [min(1.0, 2 * value) for value in ramp]
     named = [
-        Named("no auxiliary losses", line([ramp], variant="none")),
-        Named("OL-AUX-5", line([twice])),
-        Named("no auxiliary losses", line([twice], variant="none"), "authors"),
-        Named("OL-AUX-5", line([twice]), "authors"),
+        LabelledLine("no auxiliary losses", line([ramp], variant="none")),
+        LabelledLine("OL-AUX-5", line([twice])),
+        LabelledLine("no auxiliary losses", line([twice], variant="none"), "authors"),
+        LabelledLine("OL-AUX-5", line([twice]), "authors"),
     ]
     text, rows = steps_table({FETCH: named}, {FETCH: (0.5, 0.99)})
     body = [row for row in text if row.startswith("| ") and "---" not in row]
@@ -301,7 +301,7 @@ def test_panels_say_no_more_about_an_inactive_filter_than_tables(tmp_path: Path)
         file.write_text("".join(json.dumps(json.loads(row) | rewards) + "\n" for row in file.read_text().splitlines()))
         line = Line("VisualSawyerReach", variant, [json.loads(row) for row in file.read_text().splitlines()])
         request = Request("5.2", study, tmp_path / "f.png", tmp_path)
-        shown = indicator_figures.show(request, {(line.task, variant): line}, [line.task], [variant])
+        shown = indicator_figures.make_content(request, {(line.task, variant): line}, [line.task], [variant])
         curves, panels = shown.pictures[0].rows, [panel for row in shown.pictures[1].rows for panel in row]
         assert len(panels) == titles and all(panel.has_values for panel in panels)
         assert curves[1][0].title == "VisualSawyerReach: final distance to the goal (m)"

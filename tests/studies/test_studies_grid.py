@@ -23,8 +23,8 @@ from jaxrl_vis.studies.engine.cells import (
     describe_progress,
     find_folder,
     finished_rows,
+    format_budget,
     is_finished,
-    show_budget,
     split_seeds,
 )
 from jaxrl_vis.studies.engine.grid import run_cells, train_command
@@ -256,7 +256,7 @@ def test_seeds_can_be_split_and_names_say_which() -> None:
     parts = split_seeds(make_cell("a", seeds=5, seed=3, env_steps=250_000), 2)
     assert [part.name for part in parts] == ["a-seeds3to4-250k", "a-seeds5to6-250k", "a-seed7-250k"]
     assert [list(part.seeds) for part in parts] == [[3, 4], [5, 6], [7]]
-    assert [show_budget(steps) for steps in (800, 1234, 19_200, 600_000, 1_440_000)] == [
+    assert [format_budget(steps) for steps in (800, 1234, 19_200, 600_000, 1_440_000)] == [
         "800",
         "1234",
         "19.2k",

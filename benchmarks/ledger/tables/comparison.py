@@ -1,4 +1,4 @@
-"""README table of five figures compared with alternative software, written from the records."""
+"""README table of figures compared with alternative software, written from the records."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -8,7 +8,7 @@ from typing import Any
 from benchmarks.claims import ol_aux
 from benchmarks.ledger import evidence
 from benchmarks.ledger.records import RESULTS, read_all
-from benchmarks.ledger.tables.lab_results import MISSING, find, short
+from benchmarks.ledger.tables.lab_results import MISSING, find_record, format_short
 from benchmarks.ledger.tables.lab_rows import DEVICES, Figure
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.studies.figures.authors import released_curves
@@ -40,6 +40,7 @@ class Rate:
 
 
 _IMAGE = {"image_size": 64, "pixels": "rgbd"}
+_LABELLED = {"image_size": 64, "pixels": "rgbds"}
 
 RATES = (
     Rate(
@@ -49,6 +50,15 @@ RATES = (
     Rate(
         "Images of MuJoCo Warp's own scene of 127 geoms, likewise",
         *("render/scene", "render/peer_warp", {"scene": "primitives", **_IMAGE}, "H200", "images", "MuJoCo Warp"),
+    ),
+    Rate(
+        "Images of a Fetch arm with its own meshes, 64x64 RGB-D and labels, on an H100",
+        *("render/scene", "render/peer_warp", {"scene": "fetch_mesh", **_LABELLED}, "H100", "images", "MuJoCo Warp"),
+    ),
+    Rate(
+        "Images of 500 meshes with shadows, likewise",
+        *("render/scene", "render/peer_warp", {"scene": "clutter", "shadows": True, **_LABELLED}, "H100", "images"),
+        "MuJoCo Warp",
     ),
     Rate(
         "Images of VisualFetchReach on two CPU cores",
@@ -66,14 +76,14 @@ RATES = (
 def _rate_cells(row: Rate, records: list[dict[str, Any]]) -> tuple[str, str, str] | None:
     """Format our rate, the peer's and their ratio; None without records."""
     device = DEVICES[row.device]
-    theirs = find(Figure(row.peer, row.config, "", minimum_of="ours_over_peer"), device, records)
+    theirs = find_record(Figure(row.peer, row.config, "", minimum_of="ours_over_peer"), device, records)
     if theirs is None:
         return None
     same = {name: value for name, value in theirs["config"].items() if name != "images"}  # batch sizes may differ
-    ours = find(Figure(row.ours, same, ""), device, records)
+    ours = find_record(Figure(row.ours, same, ""), device, records)
     if ours is None:
         return None
-    rates = [f"{short(record['value'])} {row.unit}/s" for record in (ours, theirs)]
+    rates = [f"{format_short(record['value'])} {row.unit}/s" for record in (ours, theirs)]
     return rates[0], f"{row.other}: {rates[1]}", f"{theirs['details']['ours_over_peer']:.3g} times"
 
 
@@ -89,8 +99,11 @@ def _learning_cells(results: Path) -> tuple[str, str, str] | None:
     if ours is None or repeated is None or theirs is None:
         return None
     fast, paper = (_steps_per_update(rows) for rows in (run.rows, repetition.rows))
-    here = f"{short(ours)} steps with `fast`, {fast} an update; {short(repeated)} with the authors' settings, {paper} an update"
-    return here, f"the authors' release, OL-AUX-5: {short(theirs)} steps", f"{theirs / ours:.3g} times fewer"
+    here = (
+        f"{format_short(ours)} steps with `fast`, {fast} an update; "
+        f"{format_short(repeated)} with the authors' settings, {paper} an update"
+    )
+    return here, f"the authors' release, OL-AUX-5: {format_short(theirs)} steps", f"{theirs / ours:.3g} times fewer"
 
 
 def _steps_per_update(rows: Sequence[dict[str, Any]]) -> int:
@@ -99,7 +112,7 @@ def _steps_per_update(rows: Sequence[dict[str, Any]]) -> int:
 
 
 def comparison_table(results: Path = RESULTS) -> str:
-    """Write the table, as Markdown."""
+    """Return the table of README.md and docs/index.md as Markdown."""
     return "\n".join(_lines(results))
 
 

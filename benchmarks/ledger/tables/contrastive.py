@@ -20,7 +20,7 @@ _FORMS = {
 
 
 def forms_table(results: Path) -> str | None:
-    """Write the table; None without records."""
+    """Return the table as Markdown; None without records."""
     folders = sorted(folder for folder in (results / "contrastive").glob("*") if folder.is_dir())
     if not folders:
         return None
@@ -36,7 +36,7 @@ def forms_table(results: Path) -> str | None:
 
 
 def _row(folder: Path) -> tuple[tuple[int, int], str, str]:
-    """Return the place of a run in the table, its row, and its revision and device."""
+    """Return the sort key of a run in the table, its row as Markdown, and its revision and device as text."""
     record = read_record(folder)
     config = config_from_dict(record["config"])
     named = config.run.algorithm

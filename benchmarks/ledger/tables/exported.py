@@ -6,12 +6,12 @@ from typing import Any
 
 
 def exported_table(results: Path) -> str | None:
-    """Write success, difference, size and latency of each policy, as Markdown; None without a record."""
+    """Return a table of success, difference, size and latency of each policy as Markdown; None without a record."""
     paths = sorted(results.glob("exported-*.json"))
-    return "\n\n".join(_of_device(json.loads(path.read_text())) for path in paths) if paths else None
+    return "\n\n".join(_device_table(json.loads(path.read_text())) for path in paths) if paths else None
 
 
-def _of_device(record: dict[str, Any]) -> str:
+def _device_table(record: dict[str, Any]) -> str:
     head = [
         "policy",
         "episodes",

@@ -19,20 +19,20 @@ _TITLES = {
 
 
 def host_table(results: Path) -> str | None:
-    """Write the table; None without records."""
+    """Return the table as Markdown; None without records."""
     folder = results / host_learning.RESULTS.relative_to(Path("benchmarks") / "results")
     return rows(folder) if any(folder.glob("*.json")) else None
 
 
 def rows(folder: Path) -> str:
-    """Format a table of all records in ``folder``, with a row for the seeds of each mode, method and noise."""
+    """Return a table of all records in ``folder`` as Markdown, with a row for the seeds of each mode, method and noise."""
     cells = [cell for cell in host_learning.cells() if (folder / f"{cell.name}.json").exists()]
-    records = sorted((read_json(folder / f"{cell.name}.json") for cell in cells), key=_place)
+    records = sorted((read_json(folder / f"{cell.name}.json") for cell in cells), key=_sort_key)
     lines = [
         "| data | reward | camera noise | seeds | steps to 0.9 | final success | false positive rate | false negative rate |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for _, group in itertools.groupby(records, key=_place):
+    for _, group in itertools.groupby(records, key=_sort_key):
         lines.append(_row(list(group)))
     revisions = ", ".join(sorted({record["revision"][:7] for record in records}))
     versions = records[0]["versions"]
@@ -44,7 +44,7 @@ def rows(folder: Path) -> str:
     return "\n".join(lines)
 
 
-def _place(record: dict[str, Any]) -> tuple[str, int, int]:
+def _sort_key(record: dict[str, Any]) -> tuple[str, int, int]:
     return record["mode"], record["noise"], list(_TITLES).index(record["method"])
 
 
@@ -74,9 +74,9 @@ _ERRORS = ("false_positive_share", "false_negative_share")
 
 
 def _steps(record: dict[str, Any]) -> int | None:
-    """Return the first evaluation from which on three in a row are at least 0.9; None without one."""
+    """Return the environment steps of the first of three evaluations in a row with a success of 0.9 or more, or None."""
     success = [row["success"] for row in record["rows"]]
     for start in range(len(success) - host_learning.IN_A_ROW + 1):
-        if min(success[start : start + host_learning.IN_A_ROW]) >= host_learning.WANTED:
+        if min(success[start : start + host_learning.IN_A_ROW]) >= host_learning.TARGET_SUCCESS:
             return record["rows"][start]["env_steps"]
     return None

@@ -21,7 +21,7 @@ PAGE = "docs/lab/results.md"
 MISSING = "not measured yet"
 
 
-def short(value: float) -> str:
+def format_short(value: float) -> str:
     """Format a figure with three significant digits: 176 k, 1.73 M, 901, 12.3."""
     rounded = float(f"{value:.3g}")
     for factor, letter in ((1e6, " M"), (1e3, " k")):
@@ -34,8 +34,11 @@ def _three_digits(value: float) -> str:
     return f"{value:.{max(0, 2 - len(str(int(value))) + 1)}f}"
 
 
-def find(figure: Figure, device: str, records: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Select the record of a figure; return None if there is none."""
+def find_record(figure: Figure, device: str, records: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """Select the record of a figure; return None if none matches.
+
+    Of several matching records, the one with the largest value counts, or the smallest detail ``figure.minimum_of``.
+    """
     matches = [
         record
         for record in records
@@ -48,10 +51,10 @@ def find(figure: Figure, device: str, records: list[dict[str, Any]]) -> dict[str
     return max(matches, key=lambda record: record["value"], default=None)
 
 
-def _words(record: dict[str, Any]) -> dict[str, Any]:
+def _format_fields(record: dict[str, Any]) -> dict[str, Any]:
     """Return the fields for the format string of a figure."""
     config = record["config"]
-    words = {**record["details"], **config, "value": short(record["value"])}
+    words = {**record["details"], **config, "value": format_short(record["value"])}
     if "mbyte" in words.get("roofline", {}):
         words["moved_gib"] = words["roofline"]["mbyte"] * 1e6 / 2**30
     if "pixels" in config:
@@ -63,13 +66,13 @@ def _words(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def speed_cell(figures: tuple[Figure, ...], device: str, records: list[dict[str, Any]]) -> str:
-    """Format the figures of one device."""
-    shown = [(figure, find(figure, device, records)) for figure in figures]
-    return "; ".join(MISSING if record is None else figure.text.format(**_words(record)) for figure, record in shown)
+    """Format the figures of one device, separated by semicolons; `MISSING` for those without a record."""
+    shown = [(figure, find_record(figure, device, records)) for figure in figures]
+    return "; ".join(MISSING if record is None else figure.text.format(**_format_fields(record)) for figure, record in shown)
 
 
 def speed_table(results: Path) -> str:
-    """Write the speed table, as Markdown."""
+    """Return the speed table as Markdown."""
     records = [record for _, record in read_all(results) if record["name"] != evidence.NAME]
     lines = [f"| benchmark | {' | '.join(DEVICES)} |", "|---" * (1 + len(DEVICES)) + "|"]
     for row in SPEED:
@@ -87,7 +90,7 @@ def load_runs(row: Learning, results: Path) -> list[Evidence]:
     """Load the runs of a row; return an empty list if one is missing.
 
     Raises:
-        RequestError: A run has a different configuration than the row.
+        RequestError: A run has a different configuration than the row, or its files are damaged.
     """
     runs = []
     for name, config in row.runs.items():
@@ -114,23 +117,23 @@ def learning_text(row: Learning, runs: list[Evidence]) -> str:
     parts = []
     for target in row.targets:
         steps = steps_to(points, target, row.lower_is_better)
-        reached = "not reached" if steps is None else f"by {short(steps)} steps"
-        parts.append(row.word.format(target) + f" {reached}")
+        reached = "not reached" if steps is None else f"by {format_short(steps)} steps"
+        parts.append(row.value_format.format(target) + f" {reached}")
     for budget in row.steps:
         steps, value = max(point for point in points if point[0] <= budget)
-        parts.append(row.word.format(value) + f" at {short(steps)} steps")
+        parts.append(row.value_format.format(value) + f" at {format_short(steps)} steps")
     end, median = points[-1]
     finals = sorted(line[row.metric] for line in rows if line["env_steps"] == end)
     spread = f" ({finals[0]:.3g} to {finals[-1]:.3g})" if finals[0] != finals[-1] else ""
-    parts.append(row.word.format(median) + f"{spread} at the end, {short(end)} steps")
+    parts.append(row.value_format.format(median) + f"{spread} at the end, {format_short(end)} steps")
     wall, compiling = (statistics.median(times) for times in zip(*(evidence.seconds(run.rows) for run in runs), strict=True))
     return (
-        f"{'; '.join(parts)} (median of {len(finals)} seeds); {minutes(wall)}{' each' if len(runs) > 1 else ''}, "
-        f"of which {minutes(compiling)} compiling"
+        f"{'; '.join(parts)} (median of {len(finals)} seeds); {format_minutes(wall)}{' each' if len(runs) > 1 else ''}, "
+        f"of which {format_minutes(compiling)} compiling"
     )
 
 
-def minutes(seconds: float) -> str:
+def format_minutes(seconds: float) -> str:
     """Format a duration in seconds: 43 s, or 1 min 37 s."""
     rounded = round(seconds)
     return f"{rounded} s" if rounded < 60 else f"{rounded // 60} min {rounded % 60} s"
@@ -143,7 +146,11 @@ def _machine(device: dict[str, Any]) -> str:
 
 
 def results_table(results: Path) -> str:
-    """Write the results table, as Markdown."""
+    """Return the results table as Markdown.
+
+    Raises:
+        RequestError: A run has a different configuration than its row, or its files are damaged.
+    """
     lines = ["| experiment | machine | result | command |", "|---|---|---|---|"]
     for row in LEARNING:
         runs = load_runs(row, results)
@@ -154,7 +161,7 @@ def results_table(results: Path) -> str:
 
 
 def missing_rows(results: Path) -> Iterator[str]:
-    """Yield the rows and figures without a record."""
+    """Yield a line of text for each row and figure without a record."""
     for row in LEARNING:
         missing = [name for name in row.runs if evidence.load(name, results) is None]
         if missing:
@@ -163,5 +170,5 @@ def missing_rows(results: Path) -> Iterator[str]:
     for row in SPEED:
         for column, figures in row.figures.items():
             for figure in figures:
-                if find(figure, DEVICES[column], records) is None:
+                if find_record(figure, DEVICES[column], records) is None:
                     yield f"row {row.label!r} has no record {figure.name} {figure.config} of {DEVICES[column]}"

@@ -49,7 +49,7 @@ class Learning:
         label: Text of the first column.
         runs: Required configuration by name of the evidence; all seeds are pooled.
         metric: Column of the metrics.
-        word: Name of the metric in the table, as a format string: ``success {}``.
+        value_format: Name of the metric in the table, as a format string: ``success {}``.
         targets: Values for which the first steps that reach them are quoted ("X by N steps").
         steps: Environment steps at which values are quoted.
         lower_is_better: True if lower is better.
@@ -59,7 +59,7 @@ class Learning:
     label: str
     runs: dict[str, Config]
     metric: str = "eval/success"
-    word: str = "success {:.2f}"
+    value_format: str = "success {:.2f}"
     targets: tuple[float, ...] = ()
     steps: tuple[int, ...] = ()
     lower_is_better: bool = False
@@ -72,9 +72,9 @@ _IMAGES = "{image_size}x{image_size} {pixels}"
 _STEPS = f"{{value}} env-steps/s ({{envs:,}} environments, {_IMAGES})"
 
 
-def _environment(env: str, more: str = "", gpu: str = "H100") -> Speed:
+def _environment(env: str, options: str = "", gpu: str = "H100") -> Speed:
     figures = (Figure("env/steps", {"env": env}, _STEPS),)
-    return Speed(f"`bench env --env {env}`{more}", {gpu: figures, "2 CPU cores": figures})
+    return Speed(f"`bench env --env {env}`{options}", {gpu: figures, "2 CPU cores": figures})
 
 
 def _scene(size: int, pixels: str) -> Figure:
@@ -197,7 +197,7 @@ LEARNING = (
         "VisualReacher, 100x100 RGB-D, oracle reward",
         {"reacher_oracle": preset("fast", env="VisualReacher", image_size=100, seeds=5, env_steps=100_000)},
         metric="eval/goal_distance",
-        word="mean final distance {:.3f} m",
+        value_format="mean final distance {:.3f} m",
         targets=(0.03, 0.02),
         lower_is_better=True,
     ),

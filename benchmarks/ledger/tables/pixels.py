@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from benchmarks.ledger.tables.lab_results import short
+from benchmarks.ledger.tables.lab_results import format_short
 from jaxrl_vis.bench.record import load
 
 _PARITY = "pixels_parity.json"
@@ -19,7 +19,7 @@ _MEASURES = (
 
 
 def tasks_table(results: Path) -> str | None:
-    """Write camera, parity and, for each device with records, steps per second of all tasks, as Markdown; None without rows."""
+    """Return a table of camera, parity and, for each device with records, steps per second of all tasks; None without rows."""
     if not (results / _PARITY).exists():
         return None
     rows = json.loads((results / _PARITY).read_text())["rows"]
@@ -34,7 +34,7 @@ def tasks_table(results: Path) -> str | None:
 
 
 def training_table(results: Path) -> str | None:
-    """Write environment steps and times of `benchmarks.pixels.train` up to the targets, as Markdown; None without records."""
+    """Return a table of environment steps and times of `benchmarks.pixels.train` up to the targets; None without records."""
     records = [record for record in load(results / _SPEED["H100"]) if record["name"].startswith(_TARGET)]
     if not records:
         return None
@@ -59,19 +59,20 @@ def training_table(results: Path) -> str | None:
 
 
 def _cell(row: dict[str, Any], name: str, title: str, scale: float, digits: int) -> str:
-    """Format a measure; one that violates its bound is bold."""
+    """Format a measure of a row, multiplied by ``scale``, with a number of ``digits``; in bold if it violates its bound."""
     value = row["measures"][name]
     text = "" if value is None else f"{scale * value:.{digits}f}"
     return f"**{text}**" if name in row["failures"] else text
 
 
 def _speeds(path: Path) -> dict[str, str]:
-    """Return the speed by task, without and with images."""
+    """Return the steps per second without and with images, as text, by task; tasks without both are missing."""
     values: dict[str, dict[str, float]] = {}
     for record in load(path):
         if record["name"] in ("pixels/steps", "pixels/steps_with_images"):
             values.setdefault(record["config"]["task"], {})[record["name"]] = record["value"]
     complete = {task: pair for task, pair in values.items() if len(pair) == 2}
     return {
-        task: f"{short(pair['pixels/steps'])} / {short(pair['pixels/steps_with_images'])}" for task, pair in complete.items()
+        task: f"{format_short(pair['pixels/steps'])} / {format_short(pair['pixels/steps_with_images'])}"
+        for task, pair in complete.items()
     }

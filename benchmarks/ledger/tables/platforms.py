@@ -25,7 +25,7 @@ EXPECTED = (
 
 
 def platforms_table(results: Path) -> str | None:
-    """Write a row for each machine, Python and JAX, newest first, as Markdown; None without records."""
+    """Return a table with a row for each machine, Python and JAX, newest first, as Markdown; None without records."""
     rows = [_row(record) for record in _records(results)] + _benchmark_rows(results)
     if not rows:
         return None
@@ -35,7 +35,7 @@ def platforms_table(results: Path) -> str | None:
 
 
 def not_run_table(_: Path) -> str:
-    """Write the untested platforms, as Markdown."""
+    """Return a table of the untested platforms as Markdown; the folder of records is ignored."""
     return "\n".join(
         ["| untested platform | expected to work |", "|---|---|", *(f"| {name} | {text} |" for name, text in EXPECTED)]
     )

@@ -16,17 +16,17 @@ _ROWS = 10
 
 
 def cpu_table(results: Path) -> str | None:
-    """Write the table of the run on two cores, as Markdown; None without its record."""
+    """Return the table of the run on two cores as Markdown; None without its record."""
     return _table(results / "push" / "states_cpu")
 
 
 def gpu_table(results: Path) -> str | None:
-    """Write the table of the run on an H100, as Markdown; None without its record."""
+    """Return the table of the run on an H100 as Markdown; None without its record."""
     return _table(results / "push" / "states_h100")
 
 
 def _table(folder: Path) -> str | None:
-    """Write at most ten evaluations of a run, with the minimum and maximum success of its seeds; None without the folder."""
+    """Return a table of at most ten evaluations of a run, with the range of success over seeds; None without the folder."""
     if not folder.is_dir():
         return None
     rows = [row for row in read_rows(folder / "metrics.jsonl") if SUCCESS in row]
@@ -49,7 +49,7 @@ def _table(folder: Path) -> str | None:
 
 
 def _row(columns: Sequence[Sequence[float]]) -> str:
-    """Write the row of one evaluation from the values of each column by seed."""
+    """Return the row of one evaluation from the values of each of `_COLUMNS` by seed."""
     steps, updates, moved, explored, success = columns
     spread = f" ({min(success):.2f} to {max(success):.2f})" if len(success) > 1 else ""
     means = (f"{np.mean(values):.2f}" for values in (moved, explored, success))
@@ -58,7 +58,7 @@ def _row(columns: Sequence[Sequence[float]]) -> str:
 
 
 def _caption(folder: Path, seeds: Sequence[int], last: dict, reached: int | None) -> str:
-    """Write the number of seeds, revision, device and duration of a run, and when all of its seeds reached 0.95 for good."""
+    """Return a caption with seeds, revision, device and duration of a run, and ``reached``, the steps to a lasting 0.95."""
     record = read_record(folder)
     count = f"{len(seeds)} seeds in one program, mean (minimum to maximum)" if len(seeds) > 1 else "One seed"
     milestone = "" if reached is None else f" Every seed stays at 0.95 or above from {reached:,} steps on."

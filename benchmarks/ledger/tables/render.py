@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from benchmarks.ledger.tables.lab_results import short
+from benchmarks.ledger.tables.lab_results import format_short
 from jaxrl_vis.bench.record import load
 
 _WARP_RECORDS, _MUJOCO_RECORDS = "render-nvidia-h200-x1.json", "render-amd-epyc-2-cores.json"
@@ -45,23 +45,23 @@ def _table(file: Path, peer: str, title: str, with_depth: bool) -> str:
             continue
         config = ours["config"]
         images = f"{config['image_size']}x{config['image_size']} {_OUTPUTS[config['pixels']]}, {config['images']:,}"
-        rate, ratio = ("", "") if other is None else (short(other["value"]), f"{other['details']['ours_over_peer']:.3g}")
-        lines.append(f"| {_label(config)} | {images} | {short(ours['value'])} | {rate} | {ratio} |")
+        rate, ratio = ("", "") if other is None else (format_short(other["value"]), f"{other['details']['ours_over_peer']:.3g}")
+        lines.append(f"| {_label(config)} | {images} | {format_short(ours['value'])} | {rate} | {ratio} |")
     return "\n".join(lines)
 
 
 def warp_table(results: Path) -> str:
-    """Write the comparison of MuJoCo Warp's renderer with ours, in images per second, as Markdown."""
+    """Return a table that compares MuJoCo Warp's renderer with ours, in images per second, as Markdown."""
     return _table(results / _WARP_RECORDS, _WARP, "MuJoCo Warp 4.0.0", with_depth=False)
 
 
 def mujoco_table(results: Path) -> str:
-    """Write the comparison of MuJoCo's own renderer with ours, in images per second, as Markdown."""
+    """Return a table that compares MuJoCo's own renderer with ours, in images per second, as Markdown."""
     return _table(results / _MUJOCO_RECORDS, "render/peer_mujoco", "`mujoco.Renderer`", with_depth=True)
 
 
 def mesh_table(results: Path) -> str:
-    """Write the comparison of MuJoCo Warp's renderer with ours on scenes of meshes, in images per second, as Markdown."""
+    """Return a table that compares MuJoCo Warp's renderer with ours on scenes of meshes, in images per second, as Markdown."""
     records = [record for record in load(results / _MESH_RECORDS) if record["config"]["pixels"] == "rgbds"]
     ours = {str(record["config"]): record for record in records if record["name"] == _OURS}
     lines = ["| scene | images | ours | MuJoCo Warp 4.0.0 | ratio |", "|---|---|---|---|---|"]
@@ -71,6 +71,7 @@ def mesh_table(results: Path) -> str:
         config, size = record["config"], record["config"]["image_size"]
         names = [name for name in ("textures", "shadows") if config.get(name)]
         scene = config["scene"] + (f", with {' and '.join(names)}" if names else "")
-        rates = f"{short(ours[str(config)]['value'])} | {short(record['value'])} | {record['details']['ours_over_peer']:.3g}"
-        lines.append(f"| {scene} | {size}x{size}, {config['images']:,} | {rates} |")
+        rates = (format_short(each["value"]) for each in (ours[str(config)], record))
+        cells = [scene, f"{size}x{size}, {config['images']:,}", *rates, f"{record['details']['ours_over_peer']:.3g}"]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

@@ -23,7 +23,7 @@ def _kind(record: dict[str, Any]) -> tuple[str, int]:
 
 
 def devices_table(results: Path) -> str:
-    """Write the comparison of N devices with one, as Markdown; times are milliseconds per iteration."""
+    """Return a table that compares N devices with one, as Markdown; times are milliseconds per iteration."""
     records = [record for record in load(results / _RECORD) if record["details"].get("one_device_ms")]
     lines = [
         "| | devices | batch | environments | one device | all | speed-up | efficiency |",
@@ -49,7 +49,7 @@ def devices_table(results: Path) -> str:
 
 
 def processes_table(results: Path) -> str:
-    """Write the comparison of two processes with one, as Markdown; times are milliseconds per iteration."""
+    """Return a table that compares two processes with one, as Markdown; times are milliseconds per iteration."""
     lines = ["| two processes of two devices each | one process of four | two processes | efficiency |", "|---|---|---|---|"]
     for record in load(results / _RECORD):
         kind, details = record["name"].removeprefix("scaling/processes_"), record["details"]

@@ -6,20 +6,20 @@ from typing import Any
 import numpy as np
 
 from benchmarks.ledger.records import RESULTS
-from jaxrl_vis.stalks.phenotyping.measure.lens import TRIED
+from jaxrl_vis.stalks.phenotyping.measure.lens import VALIDATED
 from jaxrl_vis_envs.documents import read_json
 
 LENSES = Path("phenotyping") / "lenses.json"
 
 
 def lens_table(results: Path = RESULTS) -> str | None:
-    """Write the table of lenses; None without a record."""
+    """Return the table of lenses as Markdown; None without a record."""
     path = results / LENSES
     return lens_rows(read_json(path)["lenses"]) if path.exists() else None
 
 
 def lens_rows(lenses: dict[str, Any]) -> str:
-    """Format a table of lenses from results by focal length factor; see `benchmarks.stalks.lenses.evaluate_row`."""
+    """Return a table of lenses as Markdown, from results by focal length factor; see `stalks.lenses.evaluate_row`."""
     reference_errors = lenses.get("1", {"width_errors_mm": {}})["width_errors_mm"]
     lines = [
         "| focal length | pixels per m | view, m | stalk count | detected | false positives | ground detected | widths "
@@ -29,7 +29,7 @@ def lens_rows(lenses: dict[str, Any]) -> str:
     for factor, lens in lenses.items():
         errors = lens["width_errors_mm"]
         differences = [errors[stalk] - reference_errors[stalk] for stalk in errors.keys() & reference_errors.keys()]
-        tried = lens["pixels_per_metre"] >= TRIED.pixels_per_metre and lens["view_m"] >= TRIED.view
+        tried = lens["pixels_per_metre"] >= VALIDATED.pixels_per_metre and lens["view_m"] >= VALIDATED.view
         cells = (
             f"x {factor}",
             f"{lens['pixels_per_metre']:.0f}",
@@ -48,7 +48,7 @@ def lens_rows(lenses: dict[str, Any]) -> str:
 
 
 def coverage_table(results: Path = RESULTS) -> str | None:
-    """Write the table of 95 % intervals from the records of `phenotype eval` for each family; None without both."""
+    """Return a table of 95 % intervals from the records of `phenotype eval` for both families; None unless both exist."""
     lines = [
         "| family | seeds | widths | coverage | mean absolute error, mm | mean standard error, mm |",
         "|---|---|---|---|---|---|",

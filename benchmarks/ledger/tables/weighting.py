@@ -14,7 +14,7 @@ _BASELINE = "sum"
 
 
 def torchjd_table(results: Path) -> str | None:
-    """Write differences and residuals of all methods as Markdown; None without a record."""
+    """Return a table of differences and residuals of all methods as Markdown; None without a record."""
     if not (results / _RECORD).exists():
         return None
     record = json.loads((results / _RECORD).read_text())
@@ -32,14 +32,14 @@ def torchjd_table(results: Path) -> str | None:
 
 
 def cost_table(results: Path) -> str | None:
-    """Write the time of a step and of the weighting alone for both libraries, as Markdown; None without a GPU record."""
+    """Return a table of the time of a step and of the weighting alone for both libraries; None without a GPU record."""
     paths = sorted(results.glob("weighting_cost-nvidia-*.json"))
     if not paths:
         return None
-    return "\n\n".join(_of_device(json.loads(path.read_text())) for path in paths)
+    return "\n\n".join(_device_table(json.loads(path.read_text())) for path in paths)
 
 
-def _of_device(record: dict[str, Any]) -> str:
+def _device_table(record: dict[str, Any]) -> str:
     counts = record["size"]["losses"]
     ours, theirs = (
         {(row["method"], row["losses"], row["what"]): row["seconds"] for row in record[side]} for side in ("ours", "torchjd")
@@ -67,7 +67,7 @@ def _pair(seconds: float, peer: float | None) -> str:
 
 
 def digits_table(results: Path) -> str | None:
-    """Write the test accuracies of all weightings on supervised data, and their differences from the sum, as Markdown.
+    """Return a table of the test accuracies of all weightings on supervised data, and their differences from the sum.
 
     Differences that are significant at 5 % by the exact paired permutation test over seeds, with Holm's correction for the
     number of methods in the column, are bold. None without a record.
@@ -76,7 +76,7 @@ def digits_table(results: Path) -> str | None:
     if not path.exists():
         return None
     record = json.loads(path.read_text())
-    columns = {title: _of_problem(rows) for title, rows in record["problems"].items()}
+    columns = {title: _problem_cells(rows) for title, rows in record["problems"].items()}
     names = list(dict.fromkeys(row["method"] for rows in record["problems"].values() for row in rows))
     lines = ["| method | " + " | ".join(f"`{title}`" for title in columns) + " |", "|---|" + "---|" * len(columns)]
     lines += [f"| `{name}` | " + " | ".join(column.get(name, "") for column in columns.values()) + " |" for name in names]
@@ -90,8 +90,8 @@ def digits_table(results: Path) -> str | None:
     return "\n".join(lines)
 
 
-def _of_problem(rows: list[dict[str, Any]]) -> dict[str, str]:
-    """Return the cells of a problem by method."""
+def _problem_cells(rows: list[dict[str, Any]]) -> dict[str, str]:
+    """Return the cells of a problem by method: accuracy, and difference from the sum, in bold if significant."""
     scores = {row["method"]: np.asarray(row["test"]) for row in rows}
     baseline = scores[_BASELINE]
     others = {name: values - baseline for name, values in scores.items() if name != _BASELINE}
@@ -107,7 +107,7 @@ def _of_problem(rows: list[dict[str, Any]]) -> dict[str, str]:
 
 
 def _p_value(differences: np.ndarray) -> float:
-    """Return the p-value of the mean of differences [S] under all sign flips."""
+    """Return the two-sided p-value of the mean of differences [S] under all 2^S sign flips."""
     signs = 1 - 2 * (np.arange(2 ** len(differences))[:, None] >> np.arange(len(differences)) & 1)
     means = np.abs(signs @ differences)
     return float(np.mean(means >= np.abs(differences.sum()) - 1e-9))

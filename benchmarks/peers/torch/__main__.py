@@ -38,7 +38,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
     if names := [name for name, value in LEFT_OUT.items() if preset.value(name) != value]:
         ours = dataclasses.replace(ours, config={**ours.config, "without": " ".join(names)})
     yield ours
-    seeds = update.start(program).replace(iteration=jnp.zeros(1, jnp.int32))
+    seeds = update.init_with_full_replay(program).replace(iteration=jnp.zeros(1, jnp.int32))
     loop = jax.tree.map(lambda leaf: leaf[0], seeds)
     yield comparison.measure(program, loop.train, loop.replay, settings.repeats, ours)
 

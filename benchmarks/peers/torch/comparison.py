@@ -98,11 +98,14 @@ def distinguishable(train: TrainState, program: TrainStep, replay: ReplayState) 
 
 
 def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Reference:
-    """Take our steps from `distinguishable`, in float32 with full-precision products.
+    """Take our `STEPS` gradient steps from `distinguishable`, in float32 with full-precision products.
 
     Args:
         program: Program; its configuration and sizes are used, but not its dtype.
         train, replay: State of one seed.
+
+    Returns:
+        The steps and their starting point.
     """
     config = program.config.replace(compute_dtype="float32")
     networks = dataclasses.replace(program.networks, config=config)
@@ -249,7 +252,12 @@ class _Peer:
         return compare(self.reference, np.asarray(losses), slopes)
 
     def time(self, replay: Any, encoder: str, dtype: str, steps: int, repeats: int) -> tuple[Any, float]:
-        """Time one call of ``steps`` gradient steps; return the `Timing` and the seconds of compilation."""
+        """Time one call of ``steps`` gradient steps; return the `Timing` and the duration of compilation, s.
+
+        Raises:
+            AssertionError: The first critic loss differs from ours by more than rounding, or a network does not change.
+            FloatingPointError: A loss is not finite.
+        """
         torch = self._torch
         torch.set_float32_matmul_precision("high")  # the default of XLA
         learner = self._learner(replay, encoder, dtype)

@@ -56,7 +56,12 @@ def names_of(count: int) -> tuple[str, ...]:
 
 
 def problem(size: Size, count: int) -> tuple[dict[str, Any], dict[str, jax.Array]]:
-    """Draw parameters and a batch."""
+    """Sample parameters of a trunk and K = ``count`` heads, and a batch, all float32.
+
+    Returns:
+        Parameters: ``trunk``, three kernels [width, width], and ``heads``, a kernel [width, TARGETS] by name. Batch: ``inputs``
+        [B, width], and the targets [B, TARGETS] of each head by its name.
+    """
     keys = jax.random.split(jax.random.key(0), 3 + 2 * count)
     width = size.width
     layers = [jax.random.normal(key, (width, width)) / width**0.5 for key in keys[:3]]
@@ -78,7 +83,7 @@ def encode(trunk: list[jax.Array], batch: dict[str, jax.Array]) -> jax.Array:
 
 
 def losses_of(params: Any, features: jax.Array, batch: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """Compute the mean squared error of each head."""
+    """Compute the mean squared error [] of each head, by name."""
     return {name: jnp.mean(jnp.square(features @ head - batch[name])) for name, head in params["heads"].items()}
 
 
@@ -100,7 +105,7 @@ def time_call(function: Callable[..., Any], arguments: tuple[Any, ...], repeats:
 
 
 def time_method(name: str, size: Size, count: int) -> list[dict[str, Any]]:
-    """Time one weighting for K losses: a row for the weighting alone, and one for a step by each method that it allows."""
+    """Time one weighting for K losses, s: a row for the weighting alone, and one for a step by each method that it allows."""
     weighting, (params, batch) = jw.make_weighting(name), problem(size, count)
     state = weighting.init(names_of(count), params["trunk"])
     losses = {loss: jnp.float32(1.0) for loss in names_of(count)}

@@ -1,4 +1,7 @@
-"""Differences between the results of both sides, and how well each solves the problem that a method's paper states."""
+"""Differences between the results of both sides, and how well each solves the problem that a method's paper states.
+
+Jacobians are [K, P] float64 for K losses and P parameters, weights [K] float64.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -22,7 +25,12 @@ def relative(one: np.ndarray, other: np.ndarray, floor: np.ndarray | float = _TI
 
 
 def gap(jacobian: np.ndarray, weights: np.ndarray) -> float:
-    """Return MGDA's duality gap, relative to the largest squared gradient norm: 0 at the minimum-norm vector."""
+    """Return MGDA's duality gap, relative to the largest squared gradient norm: 0 at the minimum-norm vector.
+
+    Args:
+        jacobian: [K, P], gradients of the losses; as for all functions of `RESIDUALS`.
+        weights: [K], weights of the losses.
+    """
     step = weights @ jacobian
     return float((step @ step - (jacobian @ step).min()) / _longest(jacobian) ** 2)
 
@@ -46,26 +54,48 @@ def cagrad_loss(jacobian: np.ndarray, weights: np.ndarray) -> float:
 
 
 def cone_residual(jacobian: np.ndarray, weights: np.ndarray) -> float:
-    """Return the largest conflict of the step with a gradient: minus their cosine similarity, at least 0."""
+    """Return the largest conflict of the step with a gradient: minus their cosine similarity, at least 0.
+
+    Args:
+        jacobian: [K, P], gradients of the losses.
+        weights: [K], weights of the losses.
+    """
     step = weights @ jacobian
     lengths = np.linalg.norm(jacobian, axis=1) * max(np.linalg.norm(step), _ROUNDING * _longest(jacobian))
     return float(max(0.0, -(jacobian @ step / lengths).min()))
 
 
 def dual_residual(jacobian: np.ndarray, weights: np.ndarray) -> float:
-    """Return the largest violation of the optimality conditions of DualProj: no conflicts, and complementary slackness."""
+    """Return the largest violation of the optimality conditions of DualProj: no conflicts, and complementary slackness.
+
+    Args:
+        jacobian: [K, P], gradients of the losses.
+        weights: [K], weights of the losses.
+    """
     step, mean = weights @ jacobian, jacobian.mean(axis=0)
     slack = abs((weights - 1 / len(weights)) @ (jacobian @ step)) / max(mean @ mean, (_ROUNDING * _longest(jacobian)) ** 2)
     return max(cone_residual(jacobian, weights), float(slack))
 
 
 def fair_residual(jacobian: np.ndarray, weights: np.ndarray) -> float:
-    """Return the largest relative error of G w = w^(-1 / alpha)."""
+    """Return the largest relative error of FairGrad's condition G w = w^(-1 / alpha), for alpha = `FAIR_ALPHA`.
+
+    Args:
+        jacobian: [K, P], gradients J of the losses, with the Gramian G = J J^T.
+        weights: [K], weights w of the losses.
+    """
     return float(np.abs(jacobian @ (weights @ jacobian) * weights ** (1 / FAIR_ALPHA) - 1.0).max())
 
 
 def nash_residual(jacobian: np.ndarray, weights: np.ndarray) -> float:
-    """Return the largest relative error of G w = c / w for the mean c, because TorchJD scales the Gramian."""
+    """Return the largest relative error of Nash-MTL's condition G w = c / w.
+
+    The constant c is the mean of w G w, because TorchJD scales the Gramian.
+
+    Args:
+        jacobian: [K, P], gradients J of the losses, with the Gramian G = J J^T.
+        weights: [K], weights w of the losses.
+    """
     products = jacobian @ (weights @ jacobian) * weights
     return float(np.abs(products / products.mean() - 1.0).max())
 

@@ -69,7 +69,7 @@ def path_function(weighting: jw.Weighting, count: int) -> Callable[[jax.Array], 
 
 
 def gradvac_with_state(jacobian: jax.Array, orders: jax.Array) -> jax.Array:
-    """Compute the direction of GradVac's second step."""
+    """Compute the direction [P] of GradVac's second step from a Jacobian [K, P] and the orders [K, K] of its losses."""
     gramian, usual, weights = jacobian @ jacobian.T, jnp.zeros(2 * (len(jacobian),)), jnp.zeros(len(jacobian))
     for _ in range(2):
         weights, usual = surgery.gradvac_weights(gramian, usual, orders, VAC_BETA)
@@ -77,7 +77,11 @@ def gradvac_with_state(jacobian: jax.Array, orders: jax.Array) -> jax.Array:
 
 
 def results(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Compute all results, by ``K/NAME``; needs 64-bit JAX."""
+    """Compute the results of all methods for the arrays of `jacobians.draw`, by ``K/NAME``; needs 64-bit JAX.
+
+    Returns:
+        Weights [n, K] of the methods in `SOLVED`, weights [n, STEPS, K] of those in `READERS`, directions [n, SIZE] of others.
+    """
     directions: dict[str, Any] = {}
     for count in sorted({int(name.split("/")[0]) for name in arrays}):
         jacobians, orders = (jnp.asarray(arrays[f"{count}/{name}"]) for name in ("jacobians", "orders"))

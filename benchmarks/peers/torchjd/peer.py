@@ -53,7 +53,7 @@ METHODS: dict[str, Callable[[torch.Tensor], np.ndarray]] = {
 
 
 def drawn(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """Compute the results of random methods, with the file's random numbers instead of PyTorch's."""
+    """Compute the directions [n, SIZE] of random methods by name, with the file's random numbers instead of PyTorch's."""
     jacobians = torch.from_numpy(arrays[f"{prefix}/jacobians"])
     results: dict[str, list[np.ndarray]] = {name: [] for name in ("pcgrad", "gradvac", "graddrop", "random")}
     for index, jacobian in enumerate(jacobians):
@@ -110,7 +110,7 @@ def paths(losses: torch.Tensor) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def compute(prefix: str, path: str) -> dict[str, np.ndarray]:
-    """Compute all results for one number of losses."""
+    """Compute all results for K losses, where ``prefix`` is K as text, from the file ``path``, by ``K/NAME``."""
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
     arrays = dict(np.load(path))

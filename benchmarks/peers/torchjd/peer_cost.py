@@ -63,7 +63,7 @@ def time_call(function: Callable[[], Any], repeats: int, passes: int, budget: fl
 def problem(
     settings: dict[str, Any], count: int
 ) -> tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor, list[torch.Tensor]]:
-    """Draw trunk, heads, inputs and targets, as in `cost`."""
+    """Sample trunk, heads, inputs and targets, float32 with the shapes of those in `cost`."""
     width, size = settings["width"], settings["batch_size"]
     torch.manual_seed(0)
     trunk = [(torch.randn(width, width, device=DEVICE) / width**0.5).requires_grad_() for _ in range(3)]
@@ -91,7 +91,7 @@ def make_step(
 
 
 def main() -> None:
-    """Time all methods and write the rows."""
+    """Time all methods for the settings in the first argument (JSON), and write the rows to the file in the second."""
     settings = json.loads(sys.argv[1])
     timing, rows = (settings["repeats"], settings["passes"], settings["budget"]), []
     for count in settings["losses"]:

@@ -71,8 +71,8 @@ class BraxEnv(Env):
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
         """Step with ``action`` [A] in [-1, 1]. ``done`` stays 0, and ``info`` is passed through.
 
-        ``metrics`` are ``success`` (0 or 1) and ``goal_distance`` (unit of the task). Brax's evaluation sums them over an
-        episode.
+        ``metrics`` are those of the task: ``success`` (0 or 1), ``goal_distance`` (in its `distance_unit`) and any others.
+        Brax's evaluation sums them over an episode.
         """
         episode: Any = state.pipeline_state
         episode = self.goal_env.step(episode, action)

@@ -57,7 +57,7 @@ class GymnasiumEnv(gymnasium.Env):
         **overrides: Fields of the environment's configuration to change, as in `jaxrl_vis_envs.make`.
 
     Raises:
-        ValueError: There is no such environment, option, reward or render mode.
+        ValueError: There is no such environment, option, reward or render mode, or no camera to render from.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -88,8 +88,8 @@ class GymnasiumEnv(gymnasium.Env):
             gymnasium.error.Error: ``seed`` is negative or not a Python integer.
         """
         super().reset(seed=seed)
-        observations = self._environments.reset(np.array([_draw_seed(self.np_random)]))
-        return _first(observations), self._info(observations)
+        observations = self._environments.reset(np.array([_sample_seed(self.np_random)]))
+        return _unbatch(observations), self._info(observations)
 
     def step(self, action: np.ndarray) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Step with ``action`` [A], which is clipped to [-1, 1]; NaN counts as 0.
@@ -102,7 +102,7 @@ class GymnasiumEnv(gymnasium.Env):
             ValueError: ``action`` has the wrong shape.
         """
         observations, reward = self._environments.step(np.asarray(action)[None])
-        return _first(observations), float(reward[0]), False, self._environments.is_over, self._info(observations)
+        return _unbatch(observations), float(reward[0]), False, self._environments.is_over, self._info(observations)
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
         """Compute rewards of states [..., G] for goals [..., G]: [...] float32. ``info`` is ignored.
@@ -147,7 +147,7 @@ class GymnasiumEnv(gymnasium.Env):
         return {name: values[0].item() for name, values in self._environments.info(observations).items()}
 
 
-def _first(observations: Observations) -> Observations:
+def _unbatch(observations: Observations) -> Observations:
     return {name: values[0] for name, values in observations.items()}
 
 
@@ -167,7 +167,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         **overrides: See `GymnasiumEnv`.
 
     Raises:
-        ValueError: There is no such environment, option, reward or mode.
+        ValueError: There is no such environment, option, reward or mode, ``num_envs`` is not a positive integer, or as in
+            `GymnasiumEnv`.
     """
 
     def __init__(
@@ -271,7 +272,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return None if images is None else tuple(images)
 
     def _restart(self) -> tuple[Observations, dict[str, Any]]:
-        observations = self._environments.reset(np.array([_draw_seed(generator) for generator in self._generators]))
+        observations = self._environments.reset(np.array([_sample_seed(generator) for generator in self._generators]))
         return observations, self._infos(observations)
 
     def _infos(self, observations: Observations) -> dict[str, Any]:
@@ -280,7 +281,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
 
 
-def _draw_seed(generator: np.random.Generator) -> np.uint32:
+def _sample_seed(generator: np.random.Generator) -> np.uint32:
     return generator.integers(2**32, dtype=np.uint32)
 
 

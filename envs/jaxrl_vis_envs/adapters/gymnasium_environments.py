@@ -71,13 +71,13 @@ def _programs(env: GoalEnv) -> _Programs:
             return {"observation": env.observe(state), **observation}
         # A user's environment may observe only images.
         vector = state.achieved_state if observe_state is None else observe_state(state.data)
-        return {"observation": vector, **observation, "pixels": _to_public(env.observe(state))}
+        return {"observation": vector, **observation, "pixels": _channels_last(env.observe(state))}
 
     def reset(seeds: jax.Array) -> tuple[State, dict[str, jax.Array], jax.Array]:
         state = jax.vmap(lambda seed: env.reset(jax.random.key(seed)))(seeds)
         assert state.obs is not None
         goal = state.obs["desired_goal"]
-        goals = {"goal_pixels": _to_public(goal)} if sees_images else {}
+        goals = {"goal_pixels": _channels_last(goal)} if sees_images else {}
         # Images are returned separately, not stored in the state.
         state = state.replace(obs=None)
         return state, {**jax.vmap(observe)(state), **goals}, goal
@@ -90,7 +90,7 @@ def _programs(env: GoalEnv) -> _Programs:
     return _Programs(env, _space(shapes), jit(reset), jit(step, donate_argnums=0))
 
 
-def _to_public(image: jax.Array) -> jax.Array:
+def _channels_last(image: jax.Array) -> jax.Array:
     """Move channels last: [..., C, H, W] -> [..., H, W, C]."""
     return jnp.moveaxis(image, -3, -1)
 
@@ -106,8 +106,12 @@ def _space(shapes: dict[str, jax.ShapeDtypeStruct]) -> spaces.Dict:
 
 
 @functools.cache
-def _camera(env: GoalEnv, size: int) -> Any:
-    """Return a compiled function from the physics and domains of N environments to images [N, size, size, 3] uint8."""
+def _render_program(env: GoalEnv, size: int) -> Any:
+    """Return a compiled function from the physics and domains of N environments to images [N, size, size, 3] uint8.
+
+    Raises:
+        ValueError: The environment has no MuJoCo model with a camera.
+    """
     mj_model, camera = getattr(env, "mj_model", None), getattr(env, "camera", None)
     if mj_model is None or camera is None:
         raise ValueError(f"{type(env).__name__} has no MuJoCo model with a camera to render through")
@@ -125,6 +129,9 @@ class Environments:
         metadata: Gymnasium metadata.
         action_space: Action space of one environment.
         steps: Number of steps since `reset`.
+
+    Raises:
+        ValueError: There is no such environment, option, reward, render mode or camera.
     """
 
     def __init__(
@@ -146,11 +153,11 @@ class Environments:
         """Build the environment and its compiled functions, or reuse those with the same settings."""
         self.env = _find_or_make(*self._env_arguments)
         self.programs = _programs(self.env)
-        self._camera = None if self._render_size is None else _camera(self.env, self._render_size)
+        self._render_images = None if self._render_size is None else _render_program(self.env, self._render_size)
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled programs cannot be pickled: the receiver builds them again. Episodes continue from their current state.
-        return {name: value for name, value in vars(self).items() if name not in ("env", "programs", "_camera")}
+        return {name: value for name, value in vars(self).items() if name not in ("env", "programs", "_render_images")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -212,11 +219,11 @@ class Environments:
         Raises:
             gymnasium.error.ResetNeeded: `reset` has not been called.
         """
-        if self._camera is None:
+        if self._render_images is None:
             return None
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
-        return np.array(self._camera(self._state.data, self._state.domain))
+        return np.array(self._render_images(self._state.data, self._state.domain))
 
 
 def _planar(observations: Observations) -> np.ndarray:

@@ -173,13 +173,13 @@ def kernels(enabled: bool | None) -> Iterator[None]:
 def assume_kernels_compile() -> Iterator[None]:
     """Trace with kernels without compiling their probes first, which takes seconds and nearly always succeeds.
 
-    If the program then fails to compile, call `failed_kernels`.
+    If the program then fails to compile, call `any_kernel_failed`.
     """
     with _assume(True):
         yield
 
 
-def failed_kernels() -> bool:
+def any_kernel_failed() -> bool:
     """Return True if a kernel used under `assume_kernels_compile` does not compile; print each such kernel to stderr.
 
     If it returns True, trace the program again outside of `assume_kernels_compile`.
@@ -205,7 +205,7 @@ def use_gpu_kernels(probe: Callable[[], object] | None = None) -> bool:
         chosen = _chosen_by_environment()
     if target_platform() not in ("cuda", "gpu") or chosen is False:
         return False
-    _name_triton_dialect()
+    _register_triton_dialect()
     if chosen is True or not _has_tensor_cores() or probe is None:
         return chosen is True or _has_tensor_cores()
     if _assume.value:
@@ -222,7 +222,7 @@ def _chosen_by_environment() -> bool | None:
 
 
 @functools.cache
-def _name_triton_dialect() -> None:
+def _register_triton_dialect() -> None:
     """Register the Python module of Triton's dialect under the name at which MLIR looks for it.
 
     MLIR tries to import it for nearly every value of a kernel, and Python does not cache failed imports: without this, they
@@ -242,7 +242,7 @@ def _has_tensor_cores() -> bool:
 
 @functools.cache
 def _compiles(probe: Callable[[], object]) -> bool:
-    """Return True if a probe compiles for the first NVIDIA GPU."""
+    """Return True if a probe compiles for the first NVIDIA GPU; otherwise print the reason to stderr. Cached per probe."""
     gpu = jax.devices("cuda")[0]
 
     def compile_it() -> None:

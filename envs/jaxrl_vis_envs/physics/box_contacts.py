@@ -28,7 +28,7 @@ def supports(model: mjx.Model) -> bool:
 
 
 def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute the contacts of a model that `supports` accepts; return ``data``, whose poses must be up to date, with them."""
+    """Return ``data`` with the contacts at its poses, which must be up to date; for a model that `supports` accepts."""
     order = np.repeat(np.argsort(model.pair_dim, kind="stable"), _CONTACTS)  # MJX sorts contacts by their dimensions
     geoms = np.stack([model.pair_geom1, model.pair_geom2], axis=1)[order]
     first, second = geoms[::_CONTACTS].T
@@ -99,8 +99,8 @@ def _contact_points(
     return jnp.where(is_new & is_inside[chosen], distance, _FAR), middle + points @ rotation.T, normal
 
 
-def _select(condition: jax.Array, yes: tuple, no: tuple) -> tuple[jax.Array, ...]:
-    return tuple(jnp.where(condition, one, other) for one, other in zip(yes, no, strict=True))
+def _select(condition: jax.Array, if_true: tuple, if_false: tuple) -> tuple[jax.Array, ...]:
+    return tuple(jnp.where(condition, one, other) for one, other in zip(if_true, if_false, strict=True))
 
 
 def _move_axis_last(axis: jax.Array, rotation: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -19,7 +19,7 @@ _MAX_COUPLED_ROWS = 12
 
 
 def solve(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
-    """Compute accelerations with and without constraints (``qacc``, ``qacc_smooth``) and constraint forces
+    """Return ``data`` with accelerations under and without constraints (``qacc``, ``qacc_smooth``) and constraint forces
     (``qfrc_constraint``).
 
     Args:
@@ -39,7 +39,7 @@ def solve(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
     else:
         solved = newton.solve(model, solved) if newton.supports(model) else mjx.solve(model, solved)
         solved = _polish(model, solved) if exact else solved
-    if not _has_short_step(model, data):
+    if not _takes_own_step(model, data):
         return solved
     # Copying these fields only: MJX's factorized mass matrix, which nothing reads, would otherwise be an output of every step.
     names = ("qfrc_smooth", "qacc_smooth", "qacc", "qfrc_constraint")
@@ -60,7 +60,7 @@ def _polish(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 def euler(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Take a step of Euler's method, implicit in the joints' damping, with the accelerations and forces of `solve`."""
-    if not _has_short_step(model, data):
+    if not _takes_own_step(model, data):
         return mjx.euler(model, _add_dependency(data))
     timestep = model.opt.timestep
     velocity = data.qvel + timestep * _damped_accelerations(model, data)
@@ -85,8 +85,12 @@ def _integrate(model: mjx.Model, position: jax.Array, velocity: jax.Array) -> ja
     return moved
 
 
-def _has_short_step(model: mjx.Model, data: mjx.Data) -> bool:
-    """Return True if `euler` takes its own step: for hinges and slides with damping, a dense mass matrix and few contacts."""
+def _takes_own_step(model: mjx.Model, data: mjx.Data) -> bool:
+    """Return True if `euler` takes its own step instead of MJX's.
+
+    It does, unless implicit damping is disabled, for models that `newton` supports, and for others of hinges and slides only,
+    without actuator activations, with a dense mass matrix and few contacts.
+    """
     is_damped = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     if newton.supports(model):
         return is_damped

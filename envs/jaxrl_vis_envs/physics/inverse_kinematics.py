@@ -35,7 +35,7 @@ def reach(
         position: [3] float32 (m, world), target of the link's origin.
         rotation: [3, 3], target orientation; columns are the link's axes in the world.
         damping: Damping of three translations (m^2) and three rotations (rad^2); those with higher damping deviate first.
-        steps: Number of steps; the target is fixed during the last three.
+        steps: Number of steps, more than three; the target has arrived at the pose by the last three.
     """
 
     def improve(data: mjx.Data, fraction: jax.Array) -> tuple[mjx.Data, None]:

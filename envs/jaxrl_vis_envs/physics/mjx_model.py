@@ -101,12 +101,12 @@ def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool | None 
     if disturbed or not scalar.supports(model, exact):
         return _take_mjx_steps(model, data, count, bool(exact))
 
-    def take(data: mjx.Data) -> mjx.Data:
+    def dispatch(data: mjx.Data) -> mjx.Data:
         if prefers_scalar_engine(model):
             return scalar.simulate(model, data, count, exact)
         return _take_mjx_steps(model, data, count, bool(exact))
 
-    return dispatch_by_platform(take, data)
+    return dispatch_by_platform(dispatch, data)
 
 
 def prefers_scalar_engine(model: mjx.Model) -> bool:
@@ -196,7 +196,7 @@ def _place_capsule_contacts(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     types = jnp.asarray(model.geom_type)[contact.geom]
     is_of_capsules = jnp.all(types == int(mujoco.mjtGeom.mjGEOM_CAPSULE), axis=-1)
 
-    def place(geom: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def closest_points(geom: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         (middle_1, middle_2), (axis_1, axis_2) = data.geom_xpos[geom], data.geom_xmat[geom][:, :, 2]
         (radius_1, half_1), (radius_2, half_2) = model.geom_size[geom, :2]
         between = middle_1 - middle_2
@@ -212,7 +212,7 @@ def _place_capsule_contacts(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         distance = length - radius_1 - radius_2
         return distance, point_1 + (radius_1 + 0.5 * distance) * normal, rotations.make_frame(normal)
 
-    distance, position, frame = jax.vmap(place)(jnp.asarray(contact.geom))
+    distance, position, frame = jax.vmap(closest_points)(jnp.asarray(contact.geom))
     contact = contact.replace(
         dist=jnp.where(is_of_capsules, distance, contact.dist),
         pos=jnp.where(is_of_capsules[:, None], position, contact.pos),
@@ -244,7 +244,11 @@ def point_velocity(mj_model: mujoco.MjModel, data: mjx.Data, body: int, point: j
 
 
 def hinge_jacobian(mj_model: mujoco.MjModel, data: mjx.Data, body: int, point: jax.Array) -> jax.Array:
-    """Return the derivative of a ``point`` [3] (m, world) and of the rotation of ``body`` per radian of each hinge: [nv, 6]."""
+    """Return the derivatives of a ``point`` [3] (m, world) on ``body`` and of the body's rotation with respect to each hinge.
+
+    Returns:
+        [nv, 6] float32: translations (m/rad), then rotations (rad/rad), in the world; 0 for joints that do not move ``body``.
+    """
     moves = ancestor_joints(mj_model, body)
     axis, anchor = data.xaxis, data.xanchor
     if mj_model.nv > mj_model.njnt:  # free joints elsewhere have one axis for six degrees of freedom

@@ -31,9 +31,8 @@ _ROOT_STEPS = 8
 def supports(model: mjx.Model) -> bool:
     """Return True if this solver can replace MJX's for a model.
 
-    It supports up to 12 hinges and slides plus one free joint, pyramidal cones, and the integrators RK4 (without a free joint)
-    and Euler, the latter implicit in the damping (MuJoCo's default), with and without warm starts; but neither dry friction nor
-    activations.
+    It supports up to 12 hinges and slides plus one free joint, the Newton solver with pyramidal cones, and the integrators RK4
+    (without a free joint) and Euler, unless implicit damping is disabled; but neither dry friction nor activations.
     """
     is_free = np.asarray(model.jnt_type) == mujoco.mjtJoint.mjJNT_FREE
     has_few_joints = model.nv - 6 * is_free.sum() <= _MAX_JOINTS and is_free.sum() <= 1 and model.nq == model.nv + is_free.sum()
@@ -47,7 +46,7 @@ def supports(model: mjx.Model) -> bool:
 
 
 def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute accelerations under constraints (``qacc``) and constraint forces on the joints (``qfrc_constraint``).
+    """Return ``data`` with accelerations under constraints (``qacc``) and constraint forces on joints (``qfrc_constraint``).
 
     Args:
         model: Model that the solver `supports`; it takes ``model.opt.iterations`` Newton steps with exact line searches.
@@ -74,9 +73,9 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         slope = inertial + _product(jacobian.T, acting * residual)
         curvature = mass + _weighted_square(jacobian, acting)
         direction = -solve_positive(curvature, slope)
-        along = _product(jacobian, direction)
-        first, second = jnp.sum(direction * inertial), jnp.sum(direction * _product(mass, direction))
-        return acceleration + _line_search(residual, along, stiffness, is_equality, first, second) * direction, None
+        rate = _product(jacobian, direction)
+        linear, quadratic = jnp.sum(direction * inertial), jnp.sum(direction * _product(mass, direction))
+        return acceleration + _line_search(residual, rate, stiffness, is_equality, linear, quadratic) * direction, None
 
     start = data.qacc_smooth
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART:
@@ -111,29 +110,29 @@ def damped_accelerations(model: mjx.Model, data: mjx.Data) -> jax.Array:
 
 
 def _line_search(
-    residual: jax.Array, along: jax.Array, stiffness: jax.Array, is_equality: np.ndarray, first: jax.Array, second: jax.Array
+    residual: jax.Array, rate: jax.Array, stiffness: jax.Array, is_equality: np.ndarray, linear: jax.Array, quadratic: jax.Array
 ) -> jax.Array:
     """Return the step length of minimum cost, between 0 and `_MAX_STEP`.
 
     Args:
         residual: [R], residuals of the constraints at the start; equalities and negative residuals act.
-        along: [R], change of the residuals per unit of step length.
+        rate: [R], change of the residuals per unit of step length.
         stiffness: [R], stiffness of the constraints.
         is_equality: [R] bool, True for equalities.
-        first: Linear coefficient of the remaining cost, ``first * length + second * length**2 / 2``.
-        second: Quadratic coefficient, not negative.
+        linear: Linear coefficient of the remaining cost, ``linear * length + quadratic * length**2 / 2``.
+        quadratic: Quadratic coefficient, not negative.
     """
 
     def slope_at(length: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return slope and curvature of the cost."""
-        moved = residual + length * along
-        acting = jnp.where(is_equality | (moved < 0), stiffness, 0.0) * along
-        return first + second * length + jnp.sum(acting * moved), second + jnp.sum(acting * along)
+        moved = residual + length * rate
+        acting = jnp.where(is_equality | (moved < 0), stiffness, 0.0) * rate
+        return linear + quadratic * length + jnp.sum(acting * moved), quadratic + jnp.sum(acting * rate)
 
     if len(residual) > _MAX_CORNERS:
         return jnp.clip(_bracketed_root(slope_at), 0.0, _MAX_STEP)
     # The slope increases along the line and is linear between the corners where a constraint starts or stops acting.
-    corners = jnp.where(is_equality | (along == 0), -1.0, -residual / jnp.where(along == 0, 1.0, along))
+    corners = jnp.where(is_equality | (rate == 0), -1.0, -residual / jnp.where(rate == 0, 1.0, rate))
     slopes = jax.vmap(slope_at)(corners)[0]
     is_before = (corners > 0) & (slopes <= 0)
     is_after = (corners > 0) & (slopes > 0)
@@ -189,15 +188,15 @@ def _differentiate(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Arra
 
 
 @custom_vmap
-def _eliminate(matrices: jax.Array, rights: jax.Array) -> jax.Array:
-    """Solve a batch of systems, matrices [B, N, N] and right sides [B, N], by Gauss-Jordan elimination: [B, N].
+def _eliminate(matrices: jax.Array, rhs: jax.Array) -> jax.Array:
+    """Solve a batch of systems, matrices [B, N, N] and right-hand sides ``rhs`` [B, N], by Gauss-Jordan elimination: [B, N].
 
     The batch comes last in memory, so that arithmetic is vectorized along it. Positive definite matrices need no pivoting. An
     unrolled Cholesky factorization has fewer operations but takes longer to compile and, for 16 episodes, to run.
     """
-    size = rights.shape[-1]
-    # Rows with their right sides appended, without the columns that have become those of the identity.
-    rows = jnp.moveaxis(jnp.concatenate([matrices, rights[:, :, None]], axis=2), 0, 2)
+    size = rhs.shape[-1]
+    # Rows with their right-hand sides appended, without the columns that have become those of the identity.
+    rows = jnp.moveaxis(jnp.concatenate([matrices, rhs[:, :, None]], axis=2), 0, 2)
     for pivot in range(size):
         row = rows[pivot, 1:] / rows[pivot, 0]
         rows = (rows[:, 1:] - rows[:, :1] * row).at[pivot].set(row)
@@ -205,10 +204,10 @@ def _eliminate(matrices: jax.Array, rights: jax.Array) -> jax.Array:
 
 
 @_eliminate.def_vmap
-def _(size: int, in_batched: list[bool], matrices: jax.Array, rights: jax.Array) -> tuple[jax.Array, bool]:
+def _(size: int, in_batched: list[bool], matrices: jax.Array, rhs: jax.Array) -> tuple[jax.Array, bool]:
     def flat(array: jax.Array, is_batched: bool) -> jax.Array:
         batch = array if is_batched else jnp.broadcast_to(array, (size, *array.shape))
         return batch.reshape(-1, *batch.shape[2:])
 
-    solved = _eliminate(*map(flat, (matrices, rights), in_batched))
+    solved = _eliminate(*map(flat, (matrices, rhs), in_batched))
     return solved.reshape(size, -1, solved.shape[-1]), True

@@ -13,7 +13,7 @@ from jaxrl_vis_envs.pixels.observations import encode_depth
 Dtype = Literal["float32", "uint8"]
 Layout = Literal["dict", "images", "image"]
 PREFIX = "pixels/"
-GOAL = "/goal"
+GOAL_SUFFIX = "/goal"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,6 +26,9 @@ class Format:
         dtype: ``float32``: colours from 0 to 1. ``uint8``: colours from 0 to 255. Depths follow if there is a
             ``depth_range``.
         depth_range: Depths (m) encoded as the ends of the dtype's range, linear in between. If None, depths are in m, float32.
+
+    Raises:
+        ValueError: There is no such layout or dtype, or ``depth_range`` is not (near, far) with 0 <= near < far.
     """
 
     layout: Layout = "dict"
@@ -40,11 +43,11 @@ class Format:
             raise ValueError(f"depth_range must be (near, far) with 0 <= near < far, got {self.depth_range}")
 
     def images(self, views: dict[str, dict[str, jax.Array]], suffix: str = "") -> dict[str, jax.Array]:
-        """Return images by their names in an observation.
+        """Return images in the format's dtype and depth encoding, by their names in an observation.
 
         Args:
             views: Images from `Views`.
-            suffix: End of the names: `GOAL` for goal images.
+            suffix: End of the names: `GOAL_SUFFIX` for goal images.
 
         Returns:
             ``pixels/CAMERA`` for colours, ``pixels/CAMERA/OUTPUT`` for other outputs, each [H, W, C].
@@ -56,7 +59,7 @@ class Format:
         return observation
 
     def concatenate_images(self, images: dict[str, jax.Array]) -> jax.Array:
-        """Concatenate the channels of images, in the format's dtype.
+        """Concatenate the channels of images [H, W, ...] in the format's dtype: [H, W, C].
 
         Raises:
             ValueError: The images differ in size, or one of them cannot be converted to the dtype.
@@ -92,7 +95,7 @@ def image_names(outputs: Mapping[str, tuple[str, ...]]) -> list[str]:
         ValueError: Two images have the same name.
     """
     names = [_name(camera, output) for camera, chosen in outputs.items() for output in chosen]
-    if len(set(names)) < len(names) or any(name + GOAL in names for name in names):
+    if len(set(names)) < len(names) or any(name + GOAL_SUFFIX in names for name in names):
         raise ValueError(f"two images have the same name among {', '.join(names)}: name the cameras in a dictionary")
     return names
 

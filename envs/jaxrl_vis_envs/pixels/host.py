@@ -22,7 +22,7 @@ _POSES = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "xpos", "xmat", "x
 _BOUNDS = {"segmentation": (-1, np.iinfo(np.int32).max), "bodies": (-2, np.iinfo(np.int32).max), "normals": (-1.0, 1.0)}
 
 
-class _Drawn:
+class _PoseData:
     """Container of poses as attributes, as the renderer reads them."""
 
     def __init__(self, arrays: dict[str, jax.Array]) -> None:
@@ -50,12 +50,12 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         gymnasium.utils.RecordConstructorArgs.__init__(self, goal_image=goal_image, form=form, **options)
         gymnasium.Wrapper.__init__(self, env)
         self.views = views = Views(poses.find_model(env), **options)
-        self._inner: Any = env.unwrapped
+        self._unwrapped_env: Any = env.unwrapped
         self._form, self._goal_image = Format(**form), goal_image
         self._names = formats.image_names(views.outputs)
-        self._drawn = mujoco.MjData(views.mj_model)
+        self._posed_data = mujoco.MjData(views.mj_model)
         self._goals: dict[str, np.ndarray] = {}
-        self._draw = jax.jit(lambda arrays: self._form.images(views(_Drawn(arrays))))
+        self._draw = jax.jit(lambda arrays: self._form.images(views(_PoseData(arrays))))
         self.observation_space = self._build_space()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -63,7 +63,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         own, info = self.env.reset(seed=seed, options=options)
         if self._goal_image is not None:
             goal = poses.joint_positions(poses.physics_data(formats.goal_poses(self._goal_image, self.unwrapped)))
-            self._goals = {name + formats.GOAL: image for name, image in self._render(np.asarray(goal)).items()}
+            self._goals = {name + formats.GOAL_SUFFIX: image for name, image in self._render(np.asarray(goal)).items()}
         return self._observe(own), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -71,7 +71,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         own, reward, terminated, truncated, info = self.env.step(action)
         return self._observe(own), reward, terminated, truncated, info
 
-    def _observe(self, own: Any) -> Any:
+    def _observe(self, observation: Any) -> Any:
         # Copy the goal images: callers may keep and modify the arrays of an observation.
         images = self._render() | {name: image.copy() for name, image in self._goals.items()}
         layout = self._form.layout
@@ -79,11 +79,11 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
             return np.array(self._form.concatenate_images(images))  # type: ignore[arg-type]
         if layout == "images":
             return images
-        return (dict(own) if isinstance(own, Mapping) else {"state": own}) | images
+        return (dict(observation) if isinstance(observation, Mapping) else {"state": observation}) | images
 
     def _render(self, qpos: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Render the images at joint positions ``qpos`` [nq] (None for the current ones) and the current mocap poses."""
-        model, drawn = self.views.mj_model, self._drawn
+        model, drawn = self.views.mj_model, self._posed_data
         with self._targets() as data:
             drawn.qpos[:] = data.qpos if qpos is None else qpos
             drawn.mocap_pos[:], drawn.mocap_quat[:] = data.mocap_pos, data.mocap_quat
@@ -92,7 +92,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         return {name: np.array(image) for name, image in images.items()}
 
     def _poses(self) -> dict[str, np.ndarray]:
-        return {name: np.asarray(getattr(self._drawn, name), np.float32) for name in _POSES}
+        return {name: np.asarray(getattr(self._posed_data, name), np.float32) for name in _POSES}
 
     @contextlib.contextmanager
     def _targets(self) -> Iterator[mujoco.MjData]:
@@ -101,16 +101,16 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         Gymnasium-Robotics moves sites and bodies of targets only in a callback of its ``render``. The callback also computes
         poses, on which the next action depends, so it is called with a copy of the data.
         """
-        inner, own, model = self._inner, self._inner.data, self.views.mj_model
+        inner, own, model = self._unwrapped_env, self._unwrapped_env.data, self.views.mj_model
         if not hasattr(inner, "_render_callback"):
             yield own
             return
         sites = model.site_pos.copy()
-        mujoco.mj_copyData(self._drawn, model, own)
-        inner.data = self._drawn
+        mujoco.mj_copyData(self._posed_data, model, own)
+        inner.data = self._posed_data
         try:
             inner._render_callback()
-            yield self._drawn
+            yield self._posed_data
         finally:
             inner.data, model.site_pos[:] = own, sites
 
@@ -127,7 +127,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
             low, high = (0, 255 if image.dtype == np.uint8 else 1) if is_scaled else _BOUNDS.get(output, (0.0, far[camera]))
             spaces[name] = gymnasium.spaces.Box(low, high, image.shape, image.dtype.type)
         if self._goal_image is not None:
-            spaces |= {name + formats.GOAL: space for name, space in spaces.items()}
+            spaces |= {name + formats.GOAL_SUFFIX: space for name, space in spaces.items()}
         if self._form.layout == "image":
             low, high = (
                 self._form.concatenate_images({name: getattr(box, end) for name, box in spaces.items()})

@@ -2,7 +2,7 @@
 
 An image is planar, [C, H, W] uint8, with the channels R, G, B, D or the subset selected by ``pixels``. Depth is planar (along
 the camera's axis) and metric: 0 is the near end of the task's depth range, 255 the far end, linear in between and clipped
-outside. With ``depth_encoding="zbuffer"`` it is the content of OpenGL's depth buffer, as returned by mujoco-py.
+outside. With ``depth_encoding="zbuffer"`` it is OpenGL's depth buffer, as returned by mujoco-py, times 255.
 
 ``frame_stack`` images, of this control step and the preceding ones, can be stacked along the channels, newest first. Past
 states are stored as joint positions (`State.history`) and rendered again: rendering is cheaper than the physics, and the state
@@ -61,8 +61,8 @@ class PixelsConfig(checks.CheckedConfig):
 
 
 Observer = Callable[..., jax.Array]
-"""Function ``observer(data, history=None, domain=None)`` that renders the poses in ``data``, preceded by those in ``history``,
-with the appearance in ``domain`` (see `State`)."""
+"""Function ``observer(data, history=None, domain=None)`` that renders the poses in ``data`` and the past ones in ``history``,
+with the appearance in ``domain`` (see `State`), as one observation: an `ImageObserver`, or a function of the same form."""
 
 
 class ImageObserver:
@@ -83,7 +83,7 @@ class ImageObserver:
         self._marked = None if marked is None else np.flatnonzero(mj_model.geom_bodyid == mj_model.body(marked).id)
 
     def __call__(self, data: mjx.Data, history: jax.Array | None = None, domain: Domain | None = None) -> jax.Array:
-        """Render an observation.
+        """Render an observation: [frame_stack * channels, H, W] uint8, newest image first.
 
         Args:
             data: Physics state with up-to-date poses.
@@ -93,16 +93,16 @@ class ImageObserver:
         """
         scene = varied_scene(self.scene, domain)
         if self._config.frame_stack == 1 or history is None:
-            return jnp.tile(self._draw(scene, data), (self._config.frame_stack, 1, 1))
+            return jnp.tile(self._render(scene, data), (self._config.frame_stack, 1, 1))
 
-        def draw_at(qpos: jax.Array) -> jax.Array:
+        def render_at(qpos: jax.Array) -> jax.Array:
             with jax.default_matmul_precision("highest"):
-                return self._draw(scene, mjx_model.kinematics(self._model, data.replace(qpos=qpos)))
+                return self._render(scene, mjx_model.kinematics(self._model, data.replace(qpos=qpos)))
 
-        images = jax.vmap(draw_at)(jnp.concatenate([data.qpos[None], history]))
+        images = jax.vmap(render_at)(jnp.concatenate([data.qpos[None], history]))
         return images.reshape(-1, *images.shape[2:])
 
-    def _draw(self, scene: Scene, data: mjx.Data) -> jax.Array:
+    def _render(self, scene: Scene, data: mjx.Data) -> jax.Array:
         """Render one image [channels, H, W]."""
         wants_colour, wants_depth = self._config.pixels != "depth", self._config.pixels != "rgb"
         marks = self._marked is not None
@@ -155,6 +155,8 @@ def encode_zbuffer(depth: jax.Array, clip_range: tuple[float, float]) -> jax.Arr
 
 
 def decode_depth(encoded: jax.Array, depth_range: tuple[float, float]) -> jax.Array:
-    """Decode `encode_depth` to depths (m, float32), exact to half a quantization step of (far - near) / 255."""
+    """Decode uint8 depths ``[...]`` of `encode_depth` to float32 (m), exact to half a quantization step of (far - near) / 255
+    within ``depth_range`` (m).
+    """
     near, far = depth_range
     return near + encoded.astype(jnp.float32) * ((far - near) / 255.0)

@@ -42,6 +42,9 @@ class Poses:
             model: Model with the environment's current geometry, if it is randomised: `mjx.Model`, or brax's System. None for
                 that of ``mj_model``.
 
+        Returns:
+            Data at these joint positions, with the poses of bodies, geoms and sites; velocities and controls are not copied.
+
         Raises:
             ValueError: ``state`` has no joint positions, or those of several environments or of another model.
         """
@@ -73,7 +76,7 @@ def _has_positions(data: Any) -> bool:
 
 
 def joint_positions(data: Any) -> Any:
-    """Return the joint positions in physics data: ``qpos``, brax's ``q``, or ``data`` itself if it is an array.
+    """Return the joint positions [..., nq] in physics data: ``qpos``, brax's ``q``, or ``data`` itself if it is an array.
 
     Raises:
         ValueError: There are none.

@@ -44,7 +44,8 @@ class Views:
         body_names: Name of each label of ``bodies``.
 
     Raises:
-        ValueError: There is no such camera or output, two cameras have the same name, a dictionary lacks a camera, or as in
+        ValueError: There is no such camera or output, no camera or no output is given, two cameras have the same name, the keys
+            of a dictionary are not the cameras, ``clip_range`` is not (near, far) with 0 < near < far, or as in
             `Scene.from_mjmodel`.
     """
 
@@ -60,9 +61,9 @@ class Views:
         self.mj_model = mj_model
         by_name = named_cameras(mj_model, cameras)
         sizes, ranges = (
-            by_camera(by_name, name, value) for name, value in (("image_size", image_size), ("clip_range", clip_range))
+            values_by_camera(by_name, name, value) for name, value in (("image_size", image_size), ("clip_range", clip_range))
         )
-        self.outputs = {name: _check_outputs(value) for name, value in by_camera(by_name, "outputs", outputs).items()}
+        self.outputs = {name: _check_outputs(value) for name, value in values_by_camera(by_name, "outputs", outputs).items()}
         self.scenes: dict[str, Scene] = {}
         for name, camera in by_name.items():
             height, width = sizes[name] if isinstance(sizes[name], tuple | list) else (sizes[name], sizes[name])
@@ -133,7 +134,7 @@ def _camera_name(mj_model: mujoco.MjModel, camera: Camera) -> str:
     return (mj_model.camera(int(camera)).name if camera < mj_model.ncam else "") or f"camera {camera}"
 
 
-def by_camera(cameras: Iterable[str], option: str, value: Any) -> dict[str, Any]:
+def values_by_camera(cameras: Iterable[str], option: str, value: Any) -> dict[str, Any]:
     """Return the values of an option by camera: a copy of a dictionary ``value``, or the same ``value`` for all cameras.
 
     Raises:

@@ -19,9 +19,9 @@ from jaxrl_vis_envs.pixels import formats, poses
 from jaxrl_vis_envs.pixels.formats import Dtype, Format, GoalImage, Layout
 from jaxrl_vis_envs.pixels.views import Cameras, ImageSize, Output, Views
 
-OWN = "state"
+STATE = "state"
 """Key of the environment's own observation, if that is an array."""
-HIDDEN = "unwrapped_obs"
+UNWRAPPED_OBS = "unwrapped_obs"
 """Key in ``state.info`` of the environment's own observation, if it is not part of the observation."""
 
 
@@ -132,7 +132,7 @@ class PixelEnv:
         goals = {}
         if self._goal_image is not None:
             source = formats.goal_poses(self._goal_image, state)
-            goals = self._form.images(self._render(source), formats.GOAL)
+            goals = self._form.images(self._render(source), formats.GOAL_SUFFIX)
         return self._with_images(state, None, goals)
 
     def step(self, state: Any, action: jax.Array) -> Any:
@@ -140,7 +140,7 @@ class PixelEnv:
         own, earlier, goals = self._split(state)
         changes: dict[str, Any] = {"obs": own}
         if self._form.layout != "dict":
-            changes["info"] = {name: value for name, value in state.info.items() if name != HIDDEN}
+            changes["info"] = {name: value for name, value in state.info.items() if name != UNWRAPPED_OBS}
         return self._with_images(self.env.step(_replace(state, **changes), action), earlier, goals)
 
     @property
@@ -180,19 +180,21 @@ class PixelEnv:
             images = self._form.concatenate_images(images)
             goals = self._form.concatenate_images(goals) if isinstance(goals, dict) and goals else goals
         if self._frames > 1:
-            images = jax.tree.map(self._first if earlier is None else _next, images, images if earlier is None else earlier)
+            images = jax.tree.map(
+                self._repeat_frames if earlier is None else _push_frame, images, images if earlier is None else earlier
+            )
         if layout == "image":
             obs = images if isinstance(goals, dict) else jnp.concatenate([images, goals], axis=-1)
         elif layout == "images":
             obs = images | goals
         else:
-            named = dict(own) if isinstance(own, Mapping) else {OWN: own}
+            named = dict(own) if isinstance(own, Mapping) else {STATE: own}
             if clash := set(named) & {*images, *goals}:
                 raise ValueError(f"the environment has observations of the same name: {', '.join(clash)}")
             return _replace(state, obs=named | images | goals)
-        return _replace(state, obs=obs, info={**state.info, HIDDEN: own})
+        return _replace(state, obs=obs, info={**state.info, UNWRAPPED_OBS: own})
 
-    def _first(self, image: jax.Array, _: jax.Array) -> jax.Array:
+    def _repeat_frames(self, image: jax.Array, _: jax.Array) -> jax.Array:
         """Stack an image with copies of itself along the channels, at the start of an episode."""
         return jnp.concatenate([image] * self._frames, axis=-1)
 
@@ -203,13 +205,13 @@ class PixelEnv:
         if layout == "image":
             # Goal images have as many channels as one frame of the images.
             end = obs.shape[-1] // (self._frames + has_goals) * self._frames
-            return state.info[HIDDEN], obs[:, :, :end], obs[:, :, end:] if has_goals else {}
+            return state.info[UNWRAPPED_OBS], obs[:, :, :end], obs[:, :, end:] if has_goals else {}
         images = {name: obs[name] for name in self._names}
-        goals = {name + formats.GOAL: obs[name + formats.GOAL] for name in self._names if has_goals}
+        goals = {name + formats.GOAL_SUFFIX: obs[name + formats.GOAL_SUFFIX] for name in self._names if has_goals}
         if layout == "images":
-            return state.info[HIDDEN], images, goals
+            return state.info[UNWRAPPED_OBS], images, goals
         own = {name: leaf for name, leaf in obs.items() if name not in images and name not in goals}
-        return own if self._observes_mapping else own[OWN], images, goals
+        return own if self._observes_mapping else own[STATE], images, goals
 
     @functools.cached_property
     def _observes_mapping(self) -> bool:
@@ -231,6 +233,6 @@ def _replace(state: Any, **changes: Any) -> Any:
     return state.replace(**changes) if hasattr(state, "replace") else dataclasses.replace(state, **changes)
 
 
-def _next(image: jax.Array, earlier: jax.Array) -> jax.Array:
+def _push_frame(image: jax.Array, earlier: jax.Array) -> jax.Array:
     """Append an image to the ``earlier`` ones along the channels, and drop the oldest."""
     return jnp.concatenate([earlier[..., image.shape[-1] :], image], axis=-1)

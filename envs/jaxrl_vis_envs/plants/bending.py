@@ -42,8 +42,8 @@ class Layout(NamedTuple):
 
     Attributes:
         mocap: Index of each stalk's mocap body among the mocap bodies.
-        lower, upper: Bodies; the same if stalks have no knee.
-        lower_geom, upper_geom: Geoms, likewise.
+        lower, upper: Bodies of the segments; the same if stalks have no knee.
+        lower_geom, upper_geom: Geoms of the segments; the same if stalks have no knee.
         joints: [N, P, 2], hinges about x and y, at ground and knee (P = 2) or at the ground alone (P = 1).
     """
 
@@ -66,7 +66,7 @@ def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...], kne
         stalks: Number of stalks.
         pushed_by: Names of geoms that push the upper segments.
         knees: If False, stalks are one straight segment that rotates about its foot: half the joints, and exact only for a push
-            at `SWAY_HEIGHT`. Not supported by `fit`.
+            at `SWAY_HEIGHT`. Not supported by `set_stalk_properties`.
     """
     segments = ((0, KNEE), (1, TOP - KNEE)) if knees else ((None, TOP),)
     for index in range(stalks):
@@ -138,12 +138,15 @@ def shapes(stands: Stands) -> Shape:
     return Shape(stands.foot, stands.knee, stands.top, stands.radius, stands.bending_radius)
 
 
-def fit(model: Any, layout: Layout, shape: Shape) -> Any:
-    """Return an `mjx.Model` with these stalks; `place_stands` sets their positions."""
+def set_stalk_properties(model: Any, layout: Layout, shape: Shape) -> Any:
+    """Return ``model`` (an `mjx.Model`) with the lengths, radii, masses, stiffness and damping of the stalks in ``shape``.
+
+    `place_stands` sets the positions of the feet and the directions of the lower segments. Stalks must have knees.
+    """
     lower_axis, up, upper_axis = _segments(shape)
     lengths = jnp.stack([jnp.linalg.norm(lower_axis, axis=-1), jnp.linalg.norm(upper_axis, axis=-1)], axis=-1)
-    from_lower = jax.vmap(rotations.quat_inv)(_between(up, lower_axis))
-    rotation = _between(up, jax.vmap(rotations.rotate)(upper_axis, from_lower))
+    from_lower = jax.vmap(rotations.quat_inv)(_shortest_rotation(up, lower_axis))
+    rotation = _shortest_rotation(up, jax.vmap(rotations.rotate)(upper_axis, from_lower))
     bodies, geoms = (layout.lower, layout.upper), (layout.lower_geom, layout.upper_geom)
     changes = {
         name: getattr(model, name)
@@ -170,11 +173,11 @@ def fit(model: Any, layout: Layout, shape: Shape) -> Any:
 
 
 def place_stands(data: Any, layout: Layout, shape: Shape) -> Any:
-    """Return an `mjx.Data` with the stalks at their feet and the lower segments in their direction."""
+    """Return ``data`` (an `mjx.Data`) with the feet of the stalks at their positions and the lower segments aligned."""
     lower_axis, up, _ = _segments(shape)
     return data.replace(
         mocap_pos=data.mocap_pos.at[layout.mocap].set(jnp.asarray(shape.foot, jnp.float32)),
-        mocap_quat=data.mocap_quat.at[layout.mocap].set(_between(up, lower_axis)),
+        mocap_quat=data.mocap_quat.at[layout.mocap].set(_shortest_rotation(up, lower_axis)),
     )
 
 
@@ -194,11 +197,11 @@ class Gusts(NamedTuple):
     phase: Any
 
 
-def gusts(key: jax.Array, strength: Any) -> Gusts:
-    """Sample wind.
+def sample_gusts(key: jax.Array, strength: Any) -> Gusts:
+    """Sample the wind over one stand: its heading, and the frequencies and phases of its waves.
 
     Args:
-        key: Typed key, [].
+        key: One typed key.
         strength: Displacement at `SWAY_HEIGHT`, m: the amplitude of a sine wave of the same power.
     """
     heading_key, frequency_key, phase_key = jax.random.split(key, 3)
@@ -233,7 +236,7 @@ def hinge_angles(layout: Layout, nv: int, offset: jax.Array) -> jax.Array:
 
 
 def wind_torque(model: Any, layout: Layout, wind: Gusts, foot: jax.Array, time: Any) -> jax.Array:
-    """Return the torques [nv] that would hold the stalks at their `displacement`."""
+    """Return the torques [nv] float32 (N m) that would hold the stalks at their `displacement`."""
     return model.jnt_stiffness * hinge_angles(layout, model.nv, displacement(wind, foot, time))
 
 
@@ -243,23 +246,23 @@ def at_height(data: Any, layout: Layout, height: Any) -> jax.Array:
     return start + ((height - start[:, 2]) / axis[:, 2])[:, None] * axis
 
 
-def _properties(radius: Any, segment: int | None, numeric: Any) -> tuple[Any, Any, Any, Any]:
+def _properties(radius: Any, segment: int | None, xp: Any) -> tuple[Any, Any, Any, Any]:
     """Return spring (N m/rad) and damper (N m s/rad) of each hinge, mass (kg) and inertia (kg m^2) of a segment of a stalk.
 
     ``segment`` is 0 for the lower segment, 1 for the upper one, None for a stalk in one segment.
     """
     length = TOP if segment is None else (KNEE, TOP - KNEE)[segment]
     compliance = SWAY_HEIGHT / 3 if segment is None else _COMPLIANCE[segment]
-    stiffness = MODULUS * 0.25 * numeric.pi * radius**4 / compliance
-    mass = _LEAVES * DENSITY * numeric.pi * radius**2 * length
+    stiffness = MODULUS * 0.25 * xp.pi * radius**4 / compliance
+    mass = _LEAVES * DENSITY * xp.pi * radius**2 * length
     inertia = mass * length**2 / 12
     # The whole plant rotates about the ground, the part above the knee about the knee.
-    swung = _LEAVES * DENSITY * numeric.pi * radius**2 * ((TOP - KNEE) ** 3 if segment == 1 else TOP**3) / 3
-    return stiffness, 2 * _DAMPING_RATIO * numeric.sqrt(stiffness * swung), mass, inertia
+    swung = _LEAVES * DENSITY * xp.pi * radius**2 * ((TOP - KNEE) ** 3 if segment == 1 else TOP**3) / 3
+    return stiffness, 2 * _DAMPING_RATIO * xp.sqrt(stiffness * swung), mass, inertia
 
 
 def _segments(shape: Shape) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return lower segments, the vertical and upper segments: [N, 3] each."""
+    """Return lower segments (m), upward unit vectors and upper segments (m), as vectors [N, 3] from bottom to top."""
     lower_axis, upper_axis = jnp.asarray(shape.knee - shape.foot), jnp.asarray(shape.top - shape.knee)
     return lower_axis, jnp.zeros_like(lower_axis).at[:, 2].set(1.0), upper_axis
 
@@ -268,11 +271,11 @@ def _upward(length: jax.Array) -> jax.Array:
     return jnp.zeros((*length.shape, 3), jnp.float32).at[..., 2].set(length)
 
 
-def _between(one: jax.Array, other: jax.Array) -> jax.Array:
-    """Return quaternions [N, 4] of the shortest rotations from directions ``one`` to ``other`` [N, 3], less than half a turn
+def _shortest_rotation(start: jax.Array, end: jax.Array) -> jax.Array:
+    """Return quaternions [N, 4] of the shortest rotations from directions ``start`` to ``end`` [N, 3], less than half a turn
     apart.
     """
-    one = one / jnp.linalg.norm(one, axis=-1, keepdims=True)
-    other = other / jnp.linalg.norm(other, axis=-1, keepdims=True)
-    quaternion = jnp.concatenate([1.0 + jnp.sum(one * other, axis=-1, keepdims=True), jnp.cross(one, other)], axis=-1)
+    start = start / jnp.linalg.norm(start, axis=-1, keepdims=True)
+    end = end / jnp.linalg.norm(end, axis=-1, keepdims=True)
+    quaternion = jnp.concatenate([1.0 + jnp.sum(start * end, axis=-1, keepdims=True), jnp.cross(start, end)], axis=-1)
     return quaternion / jnp.linalg.norm(quaternion, axis=-1, keepdims=True)

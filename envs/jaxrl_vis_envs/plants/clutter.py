@@ -8,15 +8,16 @@ import numpy as np
 from jaxrl_vis_envs.plants.family import Family
 from jaxrl_vis_envs.plants.field import Leaf, Plot, Stalk, generator
 
-_PIECE = 0.1  # m: maximum length of the pieces of long objects, so that pieces out of sight can be culled
-_TURN = np.array([0.0, 0.0, 1.0])
+_MAX_SEGMENT = 0.1  # m: maximum length of the pieces of long objects, so that pieces out of sight can be culled
+_UP = np.array([0.0, 0.0, 1.0])
 
 
 def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Leaf, list[float]]]]:
-    """Sample the objects of a plot by day.
+    """Sample the objects of a plot by day, determined by its family and seed.
 
     Returns:
-        Round objects as chains of cones, and flat ones as ribbons, each with its material (`surfaces.MATERIAL`).
+        Round objects as chains of truncated cones (`Stalk`), and flat ones as ribbons (`Leaf`), each with its material
+        (`surfaces.MATERIAL`).
     """
     rng = generator(plot.family, plot.seed, "objects")
     family, scene = plot.family, plot.family.scene
@@ -31,18 +32,18 @@ def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Lea
             continue
         paint = material(rng)
         if kind == "pole":
-            top = foot + [*rng.normal(0.0, 0.04, 2), 0.0] + _TURN * rng.uniform(0.3, 2.6)
-            round_things.append((_tube([foot, top], _thickness(rng, 0.003, 0.05)), paint))
+            top = foot + [*rng.normal(0.0, 0.04, 2), 0.0] + _UP * rng.uniform(0.3, 2.6)
+            round_things.append((_tube([foot, top], _sample_log_uniform(rng, 0.003, 0.05)), paint))
         elif kind == "legs":
             for side in (-0.09, 0.09):
                 start = foot + [side, rng.uniform(0.1, 0.8), 0.0]
-                round_things.append((_tube([start, start + 0.9 * _TURN], rng.uniform(0.05, 0.08)), paint))
+                round_things.append((_tube([start, start + 0.9 * _UP], rng.uniform(0.05, 0.08)), paint))
         else:
             high = rng.uniform(0.02, 1.6)
             across = rng.normal(0.0, 1.0 if kind == "tube" else 0.05, 3) + [1.0, 0.0, 0.0]
             across *= rng.uniform(0.5, 2.5) / np.linalg.norm(across)
-            start = foot + high * _TURN
-            radius = _thickness(rng, 0.005, 0.04) if kind == "tube" else rng.uniform(0.001, 0.005)
+            start = foot + high * _UP
+            radius = _sample_log_uniform(rng, 0.005, 0.04) if kind == "tube" else rng.uniform(0.001, 0.005)
             round_things.append((_tube([start, start + across], radius), paint))
     if scene.potted:
         round_things += _pots(rng, plot)
@@ -56,7 +57,7 @@ def _offset_from_row(rng: np.random.Generator, family: Family) -> float:
     return rng.uniform(-0.3 * family.rig.distance, 0.0) if rng.random() < 0.25 else rng.uniform(0.0, 1.5)
 
 
-def _thickness(rng: np.random.Generator, low: float, high: float) -> float:
+def _sample_log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return low * (high / low) ** rng.random()
 
 
@@ -64,7 +65,7 @@ def _tube(corners: list[np.ndarray], radius: float, end: float | None = None) ->
     """Return a tube through corners [3], m, whose radius goes from ``radius`` to ``end``, m; None for a constant radius."""
     points = [corners[0]]
     for one, other in zip(corners, corners[1:]):
-        pieces = max(math.ceil(float(np.linalg.norm(other - one)) / _PIECE), 1)
+        pieces = max(math.ceil(float(np.linalg.norm(other - one)) / _MAX_SEGMENT), 1)
         points += [one + (other - one) * (piece + 1) / pieces for piece in range(pieces)]
     line = np.array(points, float)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
@@ -75,7 +76,7 @@ def _tube(corners: list[np.ndarray], radius: float, end: float | None = None) ->
 def _ribbon(rng: np.random.Generator, foot: np.ndarray, kind: str) -> Leaf:
     """Sample an upright ribbon: a ``strip`` with parallel sides, or a ``blade`` that bends and tapers."""
     tall = rng.uniform(0.25, 1.8)
-    knots = max(math.ceil(tall / _PIECE), 3)
+    knots = max(math.ceil(tall / _MAX_SEGMENT), 3)
     along = np.linspace(0.0, 1.0, knots + 1)
     lean = rng.normal(0.0, 0.06 if kind == "strip" else 0.25, 2)
     bend = 0.0 if kind == "strip" else rng.uniform(0.0, 0.5)
@@ -83,7 +84,7 @@ def _ribbon(rng: np.random.Generator, foot: np.ndarray, kind: str) -> Leaf:
     middle = foot + np.concatenate([sideways, (along * tall)[:, None]], axis=1)
     turn = rng.uniform(-0.8, 0.8)
     across = np.tile([math.cos(turn), math.sin(turn), 0.0], (knots + 1, 1))
-    half = _thickness(rng, 0.004, 0.03) * (np.ones(knots + 1) if kind == "strip" else np.maximum(1.0 - along**2, 0.05))
+    half = _sample_log_uniform(rng, 0.004, 0.03) * (np.ones(knots + 1) if kind == "strip" else np.maximum(1.0 - along**2, 0.05))
     return Leaf(-1, middle, across, half, kind == "strip")
 
 
@@ -92,9 +93,9 @@ def _pots(rng: np.random.Generator, plot: Plot) -> list[tuple[Stalk, list[float]
     pots = []
     for stalk in plot.measured:
         foot, tall, wide = stalk.points[0] * [1.0, 1.0, 0.0], rng.uniform(0.08, 0.19), rng.uniform(0.06, 0.14)
-        pots.append((_tube([foot, foot + tall * _TURN], 0.8 * wide, wide), plain(rng, dark)))
-        earth = _tube([foot + 0.7 * tall * _TURN, foot + 1.1 * tall * _TURN], 0.8 * wide, 0.01)
-        pots.append((earth, plain(rng, [0.06, 0.04, 0.03])))
+        pots.append((_tube([foot, foot + tall * _UP], 0.8 * wide, wide), plain_material(rng, dark)))
+        earth = _tube([foot + 0.7 * tall * _UP, foot + 1.1 * tall * _UP], 0.8 * wide, 0.01)
+        pots.append((earth, plain_material(rng, [0.06, 0.04, 0.03])))
     return pots
 
 
@@ -109,7 +110,7 @@ def _robot(rng: np.random.Generator, family: Family) -> list[tuple[Stalk, list[f
     for _ in range(rng.integers(2, 5)):
         step = np.array([-side * rng.uniform(0.0, 0.35), rng.normal(0.0, 0.05), rng.normal(-0.15, 0.2)])
         radius = rng.uniform(0.025, 0.065)
-        links.append((_tube([at, at + step], radius), plain(rng, [grey] * 3)))
+        links.append((_tube([at, at + step], radius), plain_material(rng, [grey] * 3)))
         at = at + step
     return links
 
@@ -117,20 +118,22 @@ def _robot(rng: np.random.Generator, family: Family) -> list[tuple[Stalk, list[f
 def material(rng: np.random.Generator, green: bool = False) -> list[float]:
     """Sample a material, grey, wooden, painted or straw-like, or that of a green blade; see `surfaces.MATERIAL`."""
     if green:
-        return plain(rng, list(colorsys.hsv_to_rgb(rng.uniform(0.17, 0.32), rng.uniform(0.4, 0.8), rng.uniform(0.1, 0.35))))
+        return plain_material(
+            rng, list(colorsys.hsv_to_rgb(rng.uniform(0.17, 0.32), rng.uniform(0.4, 0.8), rng.uniform(0.1, 0.35)))
+        )
     kind = rng.choice(["grey", "wood", "paint", "straw"], p=[0.45, 0.25, 0.15, 0.15])
     if kind == "grey":
-        return plain(rng, [_thickness(rng, 0.03, 0.85)] * 3)
+        return plain_material(rng, [_sample_log_uniform(rng, 0.03, 0.85)] * 3)
     hue, saturation = {
         "wood": (rng.uniform(0.05, 0.1), rng.uniform(0.2, 0.6)),
         "paint": (rng.random(), rng.uniform(0.4, 0.9)),
         "straw": (rng.uniform(0.08, 0.16), rng.uniform(0.3, 0.6)),
     }[kind]
     grain = 0.5 if kind == "wood" else 0.05
-    return plain(rng, list(colorsys.hsv_to_rgb(hue, saturation, rng.uniform(0.1, 0.7))), grain)
+    return plain_material(rng, list(colorsys.hsv_to_rgb(hue, saturation, rng.uniform(0.1, 0.7))), grain)
 
 
-def plain(rng: np.random.Generator, colour: list[float], grain: float = 0.05) -> list[float]:
+def plain_material(rng: np.random.Generator, colour: list[float], grain: float = 0.05) -> list[float]:
     """Sample a material of one colour (RGB, 0 to 1), with fibres of contrast ``grain`` and, in one of ten cases, bands."""
     bands = rng.uniform(0.2, 0.8) if rng.random() < 0.1 else 0.0
     return [

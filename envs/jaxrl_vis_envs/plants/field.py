@@ -68,7 +68,7 @@ class Stalk:
         return root, 1.0 / root
 
     def node_distance(self, height: float) -> float:
-        """Return the distance (m) along the stalk from a height in m to the nearest node."""
+        """Return the distance (m) along the stalk from a height (m) to the nearest node; infinite without nodes."""
         _, arc = self.at_height(height)
         return float(np.abs(self.nodes - arc).min(initial=math.inf))
 
@@ -78,11 +78,11 @@ class Leaf:
     """One leaf, as a bent ribbon.
 
     Attributes:
-        stalk: Index of its stalk; -1 for litter.
+        stalk: Index of its stalk; -1 for litter and flat objects (`clutter`).
         middle: [K, 3] float64, knots of the midrib, m.
         across: [K, 3] float64, unit vectors from the midrib to the edge.
         half_width: [K] float64, m.
-        dry: Whether it is dry.
+        dry: True if it is dry.
     """
 
     stalk: int
@@ -230,7 +230,7 @@ def _stalk(rng: np.random.Generator, shape: Stalks, row: int, position: np.ndarr
 
 
 def _bare_diameter(rng: np.random.Generator, shape: Stalks, arc: np.ndarray) -> np.ndarray:
-    """Return the diameter [K] (m) without sheaths and nodes: linear up to 26 inches, then decaying but above 0."""
+    """Sample the diameter [K] (m) at ``arc`` [K] (m) without sheaths and nodes: linear up to 26 inches, then decaying."""
     at_12 = max(rng.normal(shape.diameter_mean, shape.diameter_sd), shape.diameter_least)
     taper = shape.taper * at_12 / max(shape.diameter_mean, 1e-6) * max(1.0 + shape.taper_spread * rng.normal(), 0.1)
     turn = 26 * INCH
@@ -242,7 +242,7 @@ def _bare_diameter(rng: np.random.Generator, shape: Stalks, arc: np.ndarray) -> 
 
 
 def _middle_line(rng: np.random.Generator, shape: Stalks, arc: np.ndarray, nodes: np.ndarray, lean_sd: float) -> np.ndarray:
-    """Sample points [K, 3] (m) along a stalk that starts at the origin."""
+    """Sample the centre line [K, 3] (m) of a stalk that starts at the origin, at arc lengths ``arc`` [K] (m)."""
     lean = np.radians(np.clip(rng.normal(0.0, lean_sd, 2), -shape.lean_most, shape.lean_most))
     curvature = rng.normal(0.0, shape.curvature_sd, 2)
     kinks = np.radians(rng.normal(0.0, shape.zigzag, (nodes.size, 2)))

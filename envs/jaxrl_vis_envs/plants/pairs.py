@@ -12,10 +12,10 @@ from jaxrl_vis_envs.plants.cameras import Drive, Pose, drive
 from jaxrl_vis_envs.plants.family import Family
 from jaxrl_vis_envs.plants.field import Plot, generator
 from jaxrl_vis_envs.plants.rendering import drawing, imaging, shading, tables
-from jaxrl_vis_envs.plants.rendering.backdrop import draw_backdrop
-from jaxrl_vis_envs.plants.rendering.blades import Blades, cover_with_blades, draw_blades
+from jaxrl_vis_envs.plants.rendering.backdrop import sample_backdrop
+from jaxrl_vis_envs.plants.rendering.blades import Blades, render_blades, sample_blades
 from jaxrl_vis_envs.plants.rendering.degrading import degrade
-from jaxrl_vis_envs.plants.rendering.surfaces import NOTHING, Surfaces, build
+from jaxrl_vis_envs.plants.rendering.surfaces import NOTHING, Surfaces, build_surfaces
 
 _FLASH = np.array([0.05, -0.10, -0.02])
 """Position of the flash in the left camera's frame, m: above the middle of the pair."""
@@ -25,7 +25,7 @@ _MOWN = 0.25
 
 @functools.lru_cache(maxsize=2)
 def daylight(family: Family, seed: int) -> shading.Day | None:
-    """Sample the daylight and the backdrop of a plot from its settled family; None at night."""
+    """Sample the daylight and the backdrop of a plot from its settled family; None at night. The last two are cached."""
     scene = family.scene
     if scene.share <= 0:
         return None
@@ -36,7 +36,7 @@ def daylight(family: Family, seed: int) -> shading.Day | None:
     warm = np.array([1.0, rng.uniform(0.85, 1.0), rng.uniform(0.65, 0.95)])
     blue = np.array([rng.uniform(0.75, 1.0), rng.uniform(0.85, 1.0), 1.0])
     shadow = (scene.shadow[0], rng.uniform(0.2, 0.7), rng.uniform(0.05, 0.4), rng.uniform(0.02, 0.1))
-    backdrop = draw_backdrop(rng, scene.indoors > 0, scene.photographs > 0, scene.sky[0] + 0.3 * strength)
+    backdrop = sample_backdrop(rng, scene.indoors > 0, scene.photographs > 0, scene.sky[0] + 0.3 * strength)
     values = (sun, strength * warm, scene.sky[0] * blue, np.array(shadow), backdrop)
     return shading.Day(*(jnp.asarray(value, jnp.float32) for value in values))
 
@@ -47,7 +47,7 @@ def grass(family: Family, seed: int) -> Blades | None:
     rng = generator(family, seed, "grass")
     if family.scene.share <= 0 or family.scene.grass <= 0 or rng.random() < _MOWN:
         return None
-    return draw_blades(rng, family.layout.plot_length, family.rig.distance)
+    return sample_blades(rng, family.layout.plot_length, family.rig.distance)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Sequence:
     @classmethod
     def of(cls, plot: Plot) -> "Sequence":
         """Return the pairs of a plot as taken by its family's cameras."""
-        return cls(plot, build(plot), drive(plot.family, plot.seed))
+        return cls(plot, build_surfaces(plot), drive(plot.family, plot.seed))
 
     def __len__(self) -> int:
         return len(self.drive.poses)
@@ -106,27 +106,27 @@ class Sequence:
         if not 0 <= frame < len(self):
             raise IndexError(f"pair {frame} of {len(self)}")
         true = self.drive.true
-        left, instance, depth = self._take(frame, 0)
-        right, _, _ = self._take(frame, 1)
+        left, instance, depth = self._render(frame, 0)
+        right, _, _ = self._render(frame, 1)
         disparity = true.focal * true.baseline / depth
         return Pair(left, right, instance, depth, disparity, self.drive.poses[frame], frame)
 
     def left(self, frame: int) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Render the left image of one pair, with its instance and depth images; see `Pair`."""
-        return self._take(frame, 0)
+        return self._render(frame, 0)
 
-    def _take(self, frame: int, side: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Render one image, with its instance and depth images; side 0 is the left one."""
+    def _render(self, frame: int, camera_index: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Render one image, with its instance and depth images; ``camera_index`` 0 is the left camera."""
         family, drive = self.plot.family, self.drive
         pose, true = drive.poses[frame], drive.true
-        shift = side * true.baseline
+        shift = camera_index * true.baseline
         view = tables.build_view(self.surfaces, pose, true, shift)
         offset = np.array([shift, 0.0, 0.0])
         rng = generator(family, self.plot.seed, "flash")
         settings = family.imaging
         flash, blur = rng.uniform(*settings.flash), rng.uniform(*settings.blur, 2)
         gains = np.exp(settings.exposure_spread * rng.normal(size=(len(self), 1)) + 0.01 * rng.normal(size=(len(self), 2)))
-        lines = np.array([drive.line_offset, drive.line_slope]) * side
+        lines = np.array([drive.line_offset, drive.line_slope]) * camera_index
         values = (
             true.focal,
             true.centre,
@@ -137,23 +137,23 @@ class Sequence:
             (flash, settings.ambient, family.rig.distance),
         )
         shot = shading.Shot(*(jnp.asarray(value, jnp.float32) for value in values), day=daylight(family, self.plot.seed))
-        radiance, instance, depth = drawing.draw(view, shot, true.width, true.height, settings.samples)
+        radiance, instance, depth = drawing.render_view(view, shot, true.width, true.height, settings.samples)
         blades = grass(family, self.plot.seed)
         if blades is not None:
             camera = (pose.position + offset @ pose.rotation, pose.rotation, true.focal, true.centre)
             arrays = np.asarray(radiance), np.asarray(instance), np.asarray(depth)
-            radiance = jnp.asarray(cover_with_blades(*arrays, blades, camera))
-        gain = 2.0 * gains[frame, side]
+            radiance = jnp.asarray(render_blades(*arrays, blades, camera))
+        gain = 2.0 * gains[frame, camera_index]
         if shot.day is not None:
             gain *= 0.5 * family.scene.brightness[0] / max(float(radiance.mean()), 1e-4)
         exposure = imaging.Exposure(
             gain=gain,
-            blur=blur[side] * true.width / 3376,
+            blur=blur[camera_index] * true.width / 3376,
             vignetting=settings.vignetting,
             full_well=settings.full_well,
             read_noise=settings.read_noise,
             noise=settings.noise,
-            seed=int(generator(family, self.plot.seed, f"noise {frame} {side}").integers(1 << 32)),
+            seed=int(generator(family, self.plot.seed, f"noise {frame} {camera_index}").integers(1 << 32)),
         )
         image = imaging.expose(radiance, exposure)
         if shot.day is None:

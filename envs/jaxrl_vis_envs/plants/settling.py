@@ -35,7 +35,7 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
         return family
     if rng.random() >= family.scene.share:
         return dataclasses.replace(family, scene=Scene())
-    scene = _sampled_values(family.scene, rng)
+    scene = _sample_values(family.scene, rng)
     layout, stalks, leaves, textures = family.layout, family.stalks, family.leaves, family.textures
     distance = scene.distance[0]
     if scene.maize:
@@ -46,7 +46,7 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
         layout = dataclasses.replace(
             layout, stalks_mean=layout.stalks_mean * rng.uniform(0.3, 0.6), tillers=0.0, offset_sd=0.015
         )
-    leaves, textures = _ripeness(leaves, textures, rng)
+    leaves, textures = _sample_ripeness(leaves, textures, rng)
     if scene.potted:
         layout = dataclasses.replace(layout, plot_length=0.3, stalks_mean=rng.integers(1, 3), stalks_sd=0.0, rows_behind=0)
         leaves = dataclasses.replace(leaves, litter=0.0)
@@ -73,7 +73,7 @@ def _family(
     )
 
 
-def _ripeness(leaves: Leaves, textures: Textures, rng: np.random.Generator) -> tuple[Leaves, Textures]:
+def _sample_ripeness(leaves: Leaves, textures: Textures, rng: np.random.Generator) -> tuple[Leaves, Textures]:
     """Sample the ripeness of the plants, between green and dry, and return leaves and textures adapted to it."""
     ripe = rng.random()
     hue = 0.24 - 0.13 * ripe
@@ -82,7 +82,7 @@ def _ripeness(leaves: Leaves, textures: Textures, rng: np.random.Generator) -> t
     return dataclasses.replace(leaves, dry=dry), dataclasses.replace(textures, **changed)
 
 
-def _sampled_values(scene: Scene, rng: np.random.Generator) -> Scene:
+def _sample_values(scene: Scene, rng: np.random.Generator) -> Scene:
     """Sample one value from each range, and 0 or 1 for each fraction but ``borders``."""
     drawn = {}
     for field in dataclasses.fields(scene):

@@ -21,7 +21,7 @@ MAST_DISTANCE = 0.55
 STALKS = 6
 """Default number of stalks in a stand."""
 _PARKING_DISTANCE = 4.0  # m, distance of absent stalks behind the row
-_FIT = 0.1  # m, the upper segment is the secant of the stalk over this distance below and above the arm's height
+_SECANT_HALF_LENGTH = 0.1  # m, the upper segment is the secant of the stalk over this distance below and above the arm's height
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,8 +31,8 @@ class Stands:
     Attributes:
         stalk: [B, N] int32, index in `Plot.stalks`; -1 for absent ones, which are parked out of the way.
         foot: [B, N, 3] float32, foot of the stalk on the ground, m, in the frame of the stand.
-        knee: [B, N, 3] float32, joint of its two segments.
-        top: [B, N, 3] float32, end of its upper segment, whose line passes exactly through the stalk at the arm's height.
+        knee: [B, N, 3] float32, joint of its two segments, m, in the same frame.
+        top: [B, N, 3] float32, end of its upper segment, whose line passes exactly through the stalk at the arm's height, m.
         radius: [B, N, 2] float32, radius of the lower segment at half its height and of the upper one at the arm's height, m.
         bending_radius: [B, N, 2] float32, radius of untapered segments with the same compliance at the arm, m.
         origin: [B, 3] float32, origin of the stand in the plot's frame, m.
@@ -123,10 +123,10 @@ def stand_of_lines(
     return Stands(stalk.astype(np.int32)[None], *arrays)
 
 
-def concatenate_stands(parts: Sequence[Stands]) -> Stands:
+def concatenate_stands(batches: Sequence[Stands]) -> Stands:
     """Concatenate one or more batches of stands with the same number of stalks each."""
     names = [field.name for field in dataclasses.fields(Stands)]
-    return Stands(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return Stands(*(np.concatenate([getattr(batch, name) for batch in batches]) for name in names))
 
 
 def _empty(stalks: int) -> list[np.ndarray]:
@@ -136,7 +136,7 @@ def _empty(stalks: int) -> list[np.ndarray]:
 
 def _stand(plot: Plot, x: float, target: np.ndarray, stalks: int) -> tuple[np.ndarray, ...]:
     origin = stand_origin(x)
-    height = float(np.clip(target[2], KNEE + _FIT, TOP - _FIT))
+    height = float(np.clip(target[2], KNEE + _SECANT_HALF_LENGTH, TOP - _SECANT_HALF_LENGTH))
     positions = np.array([stalk.at_height(height)[0] for stalk in plot.measured]).reshape(-1, 3) - origin
     order = np.argsort(_distance_to_line(positions[:, :2], (target - origin)[:2]), kind="stable")[:stalks]
     stalk = np.full(stalks, -1)
@@ -146,7 +146,9 @@ def _stand(plot: Plot, x: float, target: np.ndarray, stalks: int) -> tuple[np.nd
     radius, bending_radius = np.full((stalks, 2), 0.007), np.full((stalks, 2), 0.007)
     for slot, index in enumerate(order):
         measured = plot.measured[index]
-        middle, below, above = (measured.at_height(height + step)[0] - origin for step in (0.0, -_FIT, _FIT))
+        middle, below, above = (
+            measured.at_height(height + step)[0] - origin for step in (0.0, -_SECANT_HALF_LENGTH, _SECANT_HALF_LENGTH)
+        )
         slope = (above - below) / (above - below)[2]
         foot[slot] = measured.points[0] - origin
         knee[slot], top[slot] = middle + (KNEE - height) * slope, middle + (TOP - height) * slope

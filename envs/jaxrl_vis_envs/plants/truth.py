@@ -30,8 +30,8 @@ class StalkInView:
         visible_box: Box around the visible pixels; None if there are none.
         visible: Visible fraction of its area inside the image.
         pixels: Number of visible pixels.
-        band_box, band_visible: Box and visible fraction of the part within a band of heights; None and 0 if that is outside the
-        image.
+        band_box, band_visible: Box and visible fraction of the part within a band of heights; None and 0 if that is outside
+            the image.
     """
 
     stalk: int
@@ -122,7 +122,7 @@ def stalks_in_view(
             points = np.stack([x, y, np.ones_like(x)], axis=1) * depth[line, column][:, None]
             height = pose.to_world(points)[:, 2]
             within = int(((height >= band[0]) & (height <= band[1])).sum())
-        visible_box = _around(column, line) if line.size else None
+        visible_box = _bounding_box(column, line) if line.size else None
         stalks.append(
             StalkInView(
                 stalk=index,
@@ -168,7 +168,7 @@ def _extended_to_ground(box: Box, stalk: Stalk, pose: Pose, camera: Calibration)
     return (*box[:3], float(max(box[3], min(line, camera.height - 0.5))))
 
 
-def _around(column: np.ndarray, line: np.ndarray) -> Box:
+def _bounding_box(column: np.ndarray, line: np.ndarray) -> Box:
     """Return the box around pixels."""
     return (float(column.min()) - 0.5, float(line.min()) - 0.5, float(column.max()) + 0.5, float(line.max()) + 0.5)
 

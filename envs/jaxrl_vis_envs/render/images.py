@@ -4,7 +4,7 @@ There are three stages: all linear work, once per environment (`pixel.shapes`, `
 (`pixel.raycast`, `pixel.triangles`), an integer that is never differentiated; and, once per pixel, depth, normal and colour of
 that object from a row of a table (`pixel.surface`, `pixel.shade`). For most scenes the last two stages are one kernel on a GPU
 (`gpu.kernel`), and passes without redundant computation on a CPU (`cpu.passes`). In scenes with meshes or height fields, a
-kernel on a GPU searches for their triangles (`gpu.search`).
+kernel on a GPU searches for their triangles (`gpu.search`), and a CPU rasterises them (`cpu.raster`).
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ import numpy as np
 from jaxrl_vis_envs.compiling.compilation import dispatch_by_platform, target_platform, tracing_for
 from jaxrl_vis_envs.render import camera, cords
 from jaxrl_vis_envs.render.camera import Rays
-from jaxrl_vis_envs.render.cpu import passes
+from jaxrl_vis_envs.render.cpu import passes, raster
 from jaxrl_vis_envs.render.gpu import kernel, search
 from jaxrl_vis_envs.render.outputs import Frame, Outputs, Planes
 from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, shapes, surface, transparent, triangles
@@ -55,6 +55,7 @@ class _Search(NamedTuple):
 
 
 _PLAIN = _Search(blocks.layout, blocks.nearest, search.blocked)
+_BY_PIXELS = _Search(blocks.layout, raster.nearest, search.blocked)
 _BY_KERNELS = _Search(search.layout, search.nearest, functools.partial(search.blocked, walk=search.by_kernel))
 
 
@@ -126,6 +127,8 @@ def _fast(scene: Scene, outputs: Outputs) -> Callable[..., Planes] | None:
     for path in (kernel, passes):
         if path.can_render(scene, outputs):
             return path.draw
+    if raster.can_search(scene):
+        return _draw_rasterised
     return _draw_walking if search.can_search(scene) else None
 
 
@@ -156,6 +159,13 @@ def _draw_walking(
 ) -> Planes:
     """Render as `_draw`, with the nearest objects found by GPU kernels."""
     return _draw(outputs, scene, rotation, unit, light_table, _BY_KERNELS)
+
+
+def _draw_rasterised(
+    outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
+) -> Planes:
+    """Render as `_draw`, with the nearest triangles found by rasterisation."""
+    return _draw(outputs, scene, rotation, unit, light_table, _BY_PIXELS)
 
 
 def _draw(

@@ -39,7 +39,7 @@ class Scene:
 
     Attributes:
         size: [N, 3] float32, metres, as in `mjModel.geom_size` for each type (infinite planes: a very large half-size; tendons:
-            three times their width).
+            their width in all three columns).
         bound: [N] float32, metres, radius of each object's bounding sphere, for sorting transparent objects.
         rgba: [N, 4] float32 in [0, 1], colour of the geom or its material. Alpha is used only for the objects marked in
             ``transparent``, which is fixed when the scene is constructed.

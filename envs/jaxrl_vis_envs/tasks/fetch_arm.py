@@ -19,7 +19,7 @@ _SETTLING_SUBSTEPS = 200
 
 
 class FetchArm(PulledArm):
-    """Fetch arm with closed fingers; the model contains the parts of fetch_reach.xml."""
+    """Base class of the Fetch tasks: an arm with closed fingers, in a model that extends ``fetch_reach.xml``."""
 
     action_size = 4
     action_meaning = (
@@ -30,7 +30,7 @@ class FetchArm(PulledArm):
     def __init__(
         self, config: PulledArmConfig, mj_model: mujoco.MjModel, observer: Callable[[mujoco.MjModel], Observer] | None
     ) -> None:
-        """Compute the start.
+        """Compute the start state.
 
         Args:
             config: Settings of the task.
@@ -41,7 +41,7 @@ class FetchArm(PulledArm):
         super().__init__(config, mj_model, "gripper", observer)
 
     def _pull_grip(self, mj_model: mujoco.MjModel, mj_data: mujoco.MjData, position: np.ndarray) -> None:
-        """Pull the gripper's link to ``position`` [3] (m, world) for 0.4 s, pointing down."""
+        """Pull the gripper, pointing down, to ``position`` [3] (m, world) for 200 physics steps; modify ``mj_data``."""
         pull(mj_model, mj_data, position, np.array(_DOWN) / np.linalg.norm(_DOWN), _SETTLING_SUBSTEPS)
         mujoco.mj_forward(mj_model, mj_data)
 

@@ -1,13 +1,13 @@
-"""Fetch push: move a box over a table to where the goal image shows it, with the closed gripper of a Fetch robot.
+"""Fetch push: push a box across a table to its position in the goal image, with the closed gripper of a Fetch robot.
 
 Follows FetchPush of Gymnasium-Robotics (version 4; Plappert et al., 2018, arXiv 1802.09464): starts, goals, actions, threshold,
 horizon and the observation of the state task. Arm and camera are those of `fetch_reach`; box, table and fingers have the
 original's shapes, masses, frictions and softness.
 
     VisualFetchPush   observes RGB-D from a camera facing the robot
-    FetchPush         observes the original's 25 numbers
+    FetchPush         observes the original's 25-dimensional state
 
-State: middle of the box in the world, m. Action: as in FetchReach.
+State: position of the box's centre in the world, m. Action: as in FetchReach.
 """
 
 import dataclasses
@@ -36,15 +36,19 @@ _START_BOX, _START_BOX_VELOCITY = (1.25, 0.53, 0.4247021), (0.0, 0.0, 0.0011707)
 _FINGER_HALF_SIZE = (0.0385, 0.007, 0.0135)  # m
 # The original's mixtures of the softness and friction of two shapes. MuJoCo up to 3.2 took half the distance between two boxes
 # for their distance: twice the margin and width, and a damping ratio that halves the stiffness, make up for that.
-_SOFTER = 2**0.5
+_DAMPING_RATIO = 2**0.5
 _FINGER_CONTACT = dict(
-    condim=4, friction=(1, 1, 0.05, 0.01, 0.01), solref=(0.015, _SOFTER), solimp=(0.945, 0.97, 0.011, 0.5, 2), margin=0.002
+    condim=4,
+    friction=(1, 1, 0.05, 0.01, 0.01),
+    solref=(0.015, _DAMPING_RATIO),
+    solimp=(0.945, 0.97, 0.011, 0.5, 2),
+    margin=0.002,
 )
 _BOX_ON_TABLE = dict(
-    condim=3, friction=(1, 1, 0.005, 0.0001, 0.0001), solref=(0.02, _SOFTER), solimp=(0.9, 0.95, 0.002, 0.5, 2)
+    condim=3, friction=(1, 1, 0.005, 0.0001, 0.0001), solref=(0.02, _DAMPING_RATIO), solimp=(0.9, 0.95, 0.002, 0.5, 2)
 )
 _BOX_ON_FLOOR = dict(condim=3, friction=(1, 1, 0.005, 0.0001, 0.0001), solref=(0.02, 1), solimp=(0.9, 0.95, 0.001, 0.5, 2))
-_MOVED = 0.001  # displacement in a control step that counts as a move of the box, m; it settles by less
+_MOVE_THRESHOLD = 0.001  # displacement in a control step that counts as a move of the box, m; it settles by less
 _CANDIDATES = 32  # positions sampled at once; the probability that none is acceptable is 2e-15
 
 
@@ -104,7 +108,7 @@ class FetchPush(FetchArm):
     metric_names = ("success", "goal_distance", "moved")
 
     def __init__(self, config: FetchPushConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
-        """Build the model and compute the start.
+        """Build the model and compute the start state.
 
         Args:
             config: Settings of the task.
@@ -115,7 +119,7 @@ class FetchPush(FetchArm):
         self._box_position = int(mj_model.joint("box").qposadr[0])
         self._box_velocity = int(mj_model.joint("box").dofadr[0])
         super().__init__(config, mj_model, observer)
-        self._goal_pose, self._goal_grip = self._lifted(mj_model)
+        self._goal_pose, self._goal_grip = self._lift_gripper(mj_model)
 
     @classmethod
     def select_marked(cls, config: Any) -> str | None:
@@ -129,7 +133,7 @@ class FetchPush(FetchArm):
         mujoco.mj_forward(mj_model, mj_data)
         return mj_data
 
-    def _lifted(self, mj_model: mujoco.MjModel) -> tuple[jax.Array, jax.Array]:
+    def _lift_gripper(self, mj_model: mujoco.MjModel) -> tuple[jax.Array, jax.Array]:
         """Return ``qpos`` for goal images, except for the box's position, and the position [3] (m, world) of the grip there."""
         mj_data = mujoco.MjData(mj_model)
         mj_data.qpos[:] = self._start.qpos
@@ -142,8 +146,8 @@ class FetchPush(FetchArm):
         return jnp.asarray(mj_data.qpos, jnp.float32), jnp.asarray(mj_data.site("grip").xpos, jnp.float32)
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
-        place, _ = self._places(key)
-        return self.start_with_box(place)
+        position, _ = self._sample_positions(key)
+        return self.start_with_box(position)
 
     def state_at(self, data: mjx.Data, goal_state: jax.Array, domain: Domain | None = None) -> State:
         state = super().state_at(data, goal_state, domain)
@@ -152,37 +156,37 @@ class FetchPush(FetchArm):
     def advance(self, state: State, action: jax.Array) -> State:
         """Advance as `GoalEnv.advance`; ``metrics["moved"]`` is 1 once the box has moved by over 1 mm in a control step."""
         after = super().advance(state, action)
-        moves = jnp.linalg.norm(after.achieved_state - state.achieved_state) > _MOVED
+        moves = jnp.linalg.norm(after.achieved_state - state.achieved_state) > _MOVE_THRESHOLD
         moved = jnp.maximum(state.metrics["moved"], moves.astype(jnp.float32))
         return after.replace(metrics={**after.metrics, "moved": moved})
 
-    def start_with_box(self, place: jax.Array) -> mjx.Data:
-        """Return the start of an episode with the box at ``place`` [2] float32 (m, world)."""
-        return self._with_box(self._start, self._start.qpos, place)
+    def start_with_box(self, position: jax.Array) -> mjx.Data:
+        """Return the start of an episode with the box at ``position`` [2] float32 (m, world)."""
+        return self._with_box(self._start, self._start.qpos, position)
 
     def sample_goal(self, key: jax.Array) -> mjx.Data:
-        _, place = self._places(key)
+        _, position = self._sample_positions(key)
         still = self._start.replace(qvel=jnp.zeros_like(self._start.qvel))
-        return self._with_box(still, self._goal_pose, place)
+        return self._with_box(still, self._goal_pose, position)
 
-    def _places(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _sample_positions(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Sample the start and the goal of the box: [2] each, m in the world."""
         config = self.config
         start_key, goal_key = jax.random.split(key)
         middle = self._start.site_xpos[self._grip, :2]
 
-        def first(key: jax.Array, reach: float, origin: jax.Array, distance: float) -> jax.Array:
-            places = middle + jax.random.uniform(key, (_CANDIDATES, 2), jnp.float32, -reach, reach)
-            return places[jnp.argmax(jnp.linalg.norm(places - origin, axis=-1) >= distance)]
+        def sample_position(key: jax.Array, reach: float, origin: jax.Array, distance: float) -> jax.Array:
+            positions = middle + jax.random.uniform(key, (_CANDIDATES, 2), jnp.float32, -reach, reach)
+            return positions[jnp.argmax(jnp.linalg.norm(positions - origin, axis=-1) >= distance)]
 
-        start = first(start_key, config.object_range, middle, config.object_distance)
+        start = sample_position(start_key, config.object_range, middle, config.object_distance)
         # Slightly above the threshold, since the box meets its goal at the threshold itself.
         away = 0.0 if config.met_goals else config.threshold + 1e-4
-        return start, first(goal_key, config.goal_range, start, away)
+        return start, sample_position(goal_key, config.goal_range, start, away)
 
-    def _with_box(self, data: mjx.Data, qpos: jax.Array, place: jax.Array) -> mjx.Data:
-        """Return ``data`` with the joints at ``qpos`` and the box at ``place`` [2] (m, world)."""
-        qpos = jax.lax.dynamic_update_slice(qpos, place, (self._box_position,))
+    def _with_box(self, data: mjx.Data, qpos: jax.Array, position: jax.Array) -> mjx.Data:
+        """Return ``data`` with the joints at ``qpos`` and the box at ``position`` [2] (m, world)."""
+        qpos = jax.lax.dynamic_update_slice(qpos, position, (self._box_position,))
         return mjx_model.kinematics(self._model, data.replace(qpos=qpos))
 
     def achieved(self, data: mjx.Data) -> jax.Array:
@@ -190,14 +194,15 @@ class FetchPush(FetchArm):
 
     @property
     def converts_goals(self) -> bool:
-        return self._draw is None or super().converts_goals
+        return self._observer is None or super().converts_goals
 
     def as_goal(self, frame: jax.Array) -> jax.Array:
-        """Return the goal observation that the box in ``frame`` meets: the box there, and the arm at rest as in goal images.
+        """Return the goal that ``frame`` achieves.
 
-        A policy that observes states thus learns only where the box should be from a goal, as in the original.
+        For a state observation [25], that is the position of its box, with the arm at rest as in goal images: from a goal, a
+        policy thus learns only where the box should be, as in the original. For images see `GoalEnv.as_goal`.
         """
-        if self._draw is not None:
+        if self._observer is not None:
             return super().as_goal(frame)
         box = frame[3:6]
         return jnp.concatenate([self._goal_grip, box, box - self._goal_grip, jnp.zeros(frame.shape[0] - 9, frame.dtype)])
@@ -226,7 +231,7 @@ def _euler_angles(rotation: jax.Array) -> jax.Array:
 
 
 def _add_box(spec: mujoco.MjSpec) -> None:
-    """Add the box, and replace the fingers of FetchReach's arm by the original's."""
+    """Add the box and a floor on which it can land, and replace the fingers of FetchReach's arm by the original's."""
     for side in ("right", "left"):
         spec.delete(spec.pair(f"{side}_finger_on_table"))
         for name in (f"{side}_finger", f"{side}_fingertip"):

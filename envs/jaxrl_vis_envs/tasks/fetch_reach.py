@@ -40,7 +40,7 @@ _GREY = (0.356, 0.361, 0.376, 1.0)  # colour of the original's gripper
 # Half-sizes (m) and alpha of the boxes of the original's mocap body.
 _CROSS_HAIR = ((0.005, 0.005, 0.005, 0.7), (1.0, 0.005, 0.005, 0.1), (0.005, 1.0, 0.001, 0.1), (0.005, 0.005, 1.0, 0.1))
 # Camera of Eysenbach et al. (2022, arXiv 2206.07568), which looks at a point (m) like MuJoCo's free camera; angles in degrees.
-_THEIR_CAMERA = "contrastive_rl"
+_CONTRASTIVE_RL_CAMERA = "contrastive_rl"
 _LOOK_AT, _DISTANCE, _AZIMUTH, _ELEVATION, _FOVY = (1.2, 0.8, 0.5), 0.8, 180.0, -30.0, 45.0
 _GOAL_STEPS, _GOAL_GAIN = 10, 10.0  # control steps towards the goal before their goal image is taken; actions per metre
 GoalAt = Literal["grip", "link"]
@@ -101,15 +101,15 @@ class FetchReach(FetchArm):
     chance, difficulty = 0.008, 2.8  # benchmarks/tasks/task_difficulty.py FetchReach --episodes 1000
 
     def __init__(self, config: FetchReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
-        """Build the model and compute the start.
+        """Build the model and compute the start state.
 
         Args:
             config: Settings of the task.
             observer: Function that builds the observer (poses to images) from the model. If None, `observe_state` is used.
         """
         self._has_cross_hair = isinstance(config, VisualFetchReachConfig) and config.cross_hair
-        self._is_their_view = self.select_camera(config) == _THEIR_CAMERA
-        change = _add_cross_hair if self._has_cross_hair else _add_original_camera if self._is_their_view else None
+        self._is_contrastive_view = self.select_camera(config) == _CONTRASTIVE_RL_CAMERA
+        change = _add_cross_hair if self._has_cross_hair else _add_contrastive_rl_camera if self._is_contrastive_view else None
         mj_model = mjx_model.load_model("fetch_reach.xml", change)
         if isinstance(config, VisualFetchReachConfig) and config.finger_colour == "grey":
             for name in ("left_finger", "right_finger"):
@@ -118,8 +118,8 @@ class FetchReach(FetchArm):
 
     @classmethod
     def select_camera(cls, config: FetchReachConfig) -> str:
-        is_theirs = isinstance(config, VisualFetchReachConfig) and config.view == "contrastive_rl"
-        return _THEIR_CAMERA if is_theirs else cls.camera
+        is_contrastive_rl = isinstance(config, VisualFetchReachConfig) and config.view == "contrastive_rl"
+        return _CONTRASTIVE_RL_CAMERA if is_contrastive_rl else cls.camera
 
     @functools.cached_property
     def goal_box(self) -> tuple[np.ndarray, np.ndarray]:
@@ -140,17 +140,17 @@ class FetchReach(FetchArm):
         if not self._has_cross_hair:
             return self._start
         # The release left its mocap body at the goal it had just rendered. It does not pull: each action sets a new target.
-        return self._place_cross_hair(self._start, self._place_link(self._goal_point(key)))
+        return self._place_cross_hair(self._start, self._link_position(self._sample_goal_position(key)))
 
     def sample_goal(self, key: jax.Array) -> mjx.Data:
-        goal = self._goal_point(key)
-        return self._driven_towards(goal) if self._is_their_view else self.goal_configuration(goal)
+        goal = self._sample_goal_position(key)
+        return self._drive_towards(goal) if self._is_contrastive_view else self.goal_configuration(goal)
 
     def goal_state(self, key: jax.Array, goal_data: mjx.Data) -> jax.Array:
-        is_shown = self.config.goal_at == "grip" and not self._is_their_view
-        return self.achieved(goal_data) if is_shown else self._goal_point(key)
+        is_shown = self.config.goal_at == "grip" and not self._is_contrastive_view
+        return self.achieved(goal_data) if is_shown else self._sample_goal_position(key)
 
-    def _driven_towards(self, goal: jax.Array) -> mjx.Data:
+    def _drive_towards(self, goal: jax.Array) -> mjx.Data:
         """Return the state after ten actions proportional to the distance from the grip to ``goal`` [3] (m, world)."""
 
         def drive(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
@@ -159,13 +159,13 @@ class FetchReach(FetchArm):
 
         return jax.lax.scan(drive, self._start, length=_GOAL_STEPS)[0]
 
-    def _goal_point(self, key: jax.Array) -> jax.Array:
+    def _sample_goal_position(self, key: jax.Array) -> jax.Array:
         """Sample the goal position [3] (m, world) of an episode."""
         offset = jax.random.uniform(key, (3,), jnp.float32, -self.config.goal_range, self.config.goal_range)
         return self._start.site_xpos[self._grip] + offset
 
-    def _place_link(self, goal: jax.Array) -> jax.Array:
-        """Return the position [3] (m, world) of the gripper's link, pointing down, for a ``goal`` [3]."""
+    def _link_position(self, goal: jax.Array) -> jax.Array:
+        """Return the position [3] (m, world) of the downward gripper's link for a ``goal`` [3] (m, world); see ``goal_at``."""
         if self.config.goal_at == "link":
             return goal
         return goal - jnp.asarray(_DOWN_ROTATION @ self.mj_model.site_pos[self._grip], jnp.float32)
@@ -180,11 +180,11 @@ class FetchReach(FetchArm):
         With ``goal_at="link"``, the gripper's link is at the goal instead of the grip.
 
         For 300 goals, the joint angles differ from those after driving the arm there for 200 substeps by .002 rad (median) and
-        .02 rad (99th percentile), and a reset costs a hundredth.
+        .02 rad (99th percentile), and a reset costs a hundredth of that.
         """
         fingertip = self.mj_model.geom("right_fingertip").id
         lowest = _TABLE_TOP + float(self.mj_model.geom_pos[fingertip, 0] + self.mj_model.geom_size[fingertip, 0])
-        goal_link = self._place_link(goal)
+        goal_link = self._link_position(goal)
         rest = self._close_fingers(self._start.replace(qvel=jnp.zeros_like(self._start.qvel)))
         reachable = goal_link.at[2].max(lowest)
         data = inverse_kinematics.reach(self.mj_model, self._model, rest, self._hand, reachable, _DOWN_ROTATION)
@@ -199,13 +199,13 @@ def _add_cross_hair(spec: mujoco.MjSpec) -> None:
         )
 
 
-def _add_original_camera(spec: mujoco.MjSpec) -> None:
+def _add_contrastive_rl_camera(spec: mujoco.MjSpec) -> None:
     """Add the camera of contrastive RL's task, fixed in the world."""
     azimuth, elevation = np.deg2rad([_AZIMUTH, _ELEVATION])
     level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     forward = np.cos(elevation) * level + [0.0, 0.0, np.sin(elevation)]
     right = np.cross(forward, [0.0, 0.0, 1.0]) / np.cos(elevation)
-    camera = spec.worldbody.add_camera(name=_THEIR_CAMERA, pos=np.array(_LOOK_AT) - _DISTANCE * forward, fovy=_FOVY)
+    camera = spec.worldbody.add_camera(name=_CONTRASTIVE_RL_CAMERA, pos=np.array(_LOOK_AT) - _DISTANCE * forward, fovy=_FOVY)
     camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
     camera.alt.xyaxes = np.concatenate([right, np.cross(right, forward)])
 

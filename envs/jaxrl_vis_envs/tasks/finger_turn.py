@@ -1,4 +1,4 @@
-"""Finger turn: turn a free spinner with a two-link finger until its tip is where the goal image shows it.
+"""Finger turn: turn a free spinner with a two-link finger until its tip is at its position in the goal image.
 
 dm_control's finger as used by the authors of OL-AUX: any contact-free start, a goal angle of the spinner, a tolerance of .07 m
 at its tip (31 degrees), and 21 physics steps of 10 ms per action. With dm_control's own two, random actions move the spinner in
@@ -42,7 +42,7 @@ class FingerTurnConfig(TaskConfig):
     solver_iterations: int = 4
     """Newton iterations per physics step."""
     line_search_iterations: int = 8
-    """Line search iterations per Newton iteration of MJX's solver; the package's own, which this task uses, ignores it."""
+    """Line search iterations per Newton iteration of MJX's solver; the scalar engine ignores them (see `physics`)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -58,7 +58,7 @@ class HandReachConfig(TaskConfig):
     goal_rule: Literal["random_actions", "meet"] = "random_actions"
     """Source of goals: random actions from the start (the release), or thumb and finger meeting (Gym)."""
     goal_actions: int = 20
-    """Number of random actions that generate a goal."""
+    """Number of random actions that generate a goal, with ``goal_rule="random_actions"``."""
     goal_noise: float = 5.0
     """Standard deviation of the Gaussian noise added to each of these uniform actions before clipping to [-1, 1]."""
     substeps: int = 20
@@ -70,7 +70,7 @@ class HandReachConfig(TaskConfig):
     solver_iterations: int = 1
     """Newton iterations per physics step."""
     line_search_iterations: int = 4
-    """Line search iterations per Newton iteration of MJX's solver, which runs on a CPU (see `constraints`)."""
+    """Line search iterations per Newton iteration of MJX's solver; the scalar engine ignores them (see `physics`)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

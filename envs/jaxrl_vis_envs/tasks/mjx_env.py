@@ -57,10 +57,10 @@ class MjxGoalEnv(GoalEnv):
         self.frame_stack = getattr(config, "frame_stack", 1)
         self.mj_model = mj_model
         self._model = mjx_model.put_model(mj_model)
-        self._draw = observer(mj_model) if observer is not None else None
-        self.marks_object = self._draw is not None and self.select_marked(config) is not None
+        self._observer = observer(mj_model) if observer is not None else None
+        self.marks_object = self._observer is not None and self.select_marked(config) is not None
         self._randomization: randomization.Randomization = getattr(config, "randomization", randomization.OFF)
-        self._scene: Scene | None = getattr(self._draw, "scene", None)
+        self._scene: Scene | None = getattr(self._observer, "scene", None)
         if self._randomization.varies_appearance and self._scene is None:
             raise ValueError("camera, lights and colours can only be randomized in a task that draws images")
 
@@ -78,11 +78,11 @@ class MjxGoalEnv(GoalEnv):
 
     @abc.abstractmethod
     def sample_start(self, key: jax.Array) -> mjx.Data:
-        """Sample the start of the episode ``reset(key)``, with poses consistent with its ``qpos``; ``key`` is [], typed."""
+        """Sample the start of the episode ``reset(key)``, with poses consistent with ``qpos``; ``key`` is one typed key."""
 
     @abc.abstractmethod
     def sample_goal(self, key: jax.Array) -> mjx.Data:
-        """Sample the configuration in the goal image of ``reset(key)``, with its poses; ``key`` is [], typed."""
+        """Sample the configuration in the goal image of ``reset(key)``, with its poses; ``key`` is one typed key."""
 
     @abc.abstractmethod
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
@@ -101,7 +101,7 @@ class MjxGoalEnv(GoalEnv):
         """Return the true quantity that goals constrain, `State.achieved_state`: [G] float32."""
 
     def goal_state(self, key: jax.Array, goal_data: mjx.Data) -> jax.Array:
-        """Return the goal state [G] of ``reset(key)``, whose goal image shows ``goal_data``; by default, `achieved` of that."""
+        """Return the goal state [G] of ``reset(key)``, whose goal image shows ``goal_data``: by default, what that achieves."""
         return self.achieved(goal_data)
 
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
@@ -137,8 +137,8 @@ class MjxGoalEnv(GoalEnv):
         return self._observe(state.data, state.history, state.domain)
 
     def state_at(self, data: mjx.Data, goal_state: jax.Array, domain: randomization.Domain | None = None) -> State:
-        """Return the State of an episode that starts at ``data``, with goal state [G], without images, and with the
-        randomisation ``domain``.
+        """Return the `State` of an episode that starts at ``data``, with ``goal_state`` [G] float32 and the randomisation
+        ``domain`` (None for none); its ``obs`` is None.
         """
         history = start_history(data.qpos, self.frame_stack)
         return self._measure(data, self.achieved(data), goal_state, None, history, domain)
@@ -146,8 +146,8 @@ class MjxGoalEnv(GoalEnv):
     @property
     def observation_spec(self) -> jax.ShapeDtypeStruct:
         """Shape and dtype of `observe`, without tracing physics or renderer."""
-        if isinstance(self._draw, ImageObserver):
-            return self._draw.spec
+        if isinstance(self._observer, ImageObserver):
+            return self._observer.spec
         shape = jax.eval_shape(
             lambda data: self._observe(data, start_history(data.qpos, self.frame_stack), None), self._data_shape
         )
@@ -175,9 +175,9 @@ class MjxGoalEnv(GoalEnv):
         return varied
 
     def _observe(self, data: mjx.Data, history: jax.Array | None, domain: randomization.Domain | None) -> jax.Array:
-        if self._draw is None:
+        if self._observer is None:
             return self.observe_state(data)
-        return self._draw(data, history) if self._scene is None else self._draw(data, history, domain)
+        return self._observer(data, history) if self._scene is None else self._observer(data, history, domain)
 
 
 def register_task(task: type[MjxGoalEnv], config_class: type, visual_config_class: type) -> None:

@@ -38,7 +38,7 @@ class PulledArmConfig(TaskConfig):
 
 
 class PulledArm(MjxGoalEnv):
-    """Task with an arm without motors, pulled by its hand. Goals are positions of its grip, m in the world."""
+    """Base class of tasks with an arm without motors, pulled by its hand. By default, goals are grip positions (m, world)."""
 
     distance_unit = "m"
     control_period = CONTROL_PERIOD
@@ -50,7 +50,7 @@ class PulledArm(MjxGoalEnv):
         hand: str,
         observer: Callable[[mujoco.MjModel], Observer] | None,
     ) -> None:
-        """Compute the start.
+        """Compute the start state.
 
         Args:
             config: Settings of the task.
@@ -68,7 +68,7 @@ class PulledArm(MjxGoalEnv):
 
     @abc.abstractmethod
     def _settled(self, mj_model: mujoco.MjModel, config: PulledArmConfig) -> mujoco.MjData:
-        """Return the physics state in which every episode starts, after the arm has been pulled there and has come to rest."""
+        """Return the physics state in which every episode starts, after the arm was pulled there; it may still be moving."""
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
         return self._start

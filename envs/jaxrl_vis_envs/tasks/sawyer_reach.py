@@ -75,7 +75,7 @@ class SawyerReach(PulledArm):
     chance, difficulty = 0.010, 3.5  # benchmarks/tasks/task_difficulty.py SawyerReach --episodes 1000
 
     def __init__(self, config: SawyerReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
-        """Build the model and compute the start.
+        """Build the model and compute the start state.
 
         Args:
             config: Settings of the task.

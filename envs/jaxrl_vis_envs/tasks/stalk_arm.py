@@ -41,7 +41,7 @@ JOINTS = ARM_JOINTS + len(JAWS)
 
 
 def build(stalks: int) -> mujoco.MjModel:
-    """Build the model of the arm among stalks, without actuators: the caller applies forces to its joints."""
+    """Build the model of the arm among ``stalks`` stalks, without actuators: the caller applies forces to its joints."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         for actuator in list(spec.actuators):
@@ -52,7 +52,7 @@ def build(stalks: int) -> mujoco.MjModel:
 
 
 def build_servoed(stalks: int) -> mujoco.MjModel:
-    """Build the model of the arm with fixed, open jaws, driven by position servos, among stalks without knees.
+    """Build the model of the arm with fixed, open jaws, driven by position servos, among ``stalks`` stalks without knees.
 
     The pose of its mocap body "wind" only stores numbers.
     """
@@ -66,57 +66,57 @@ def build_servoed(stalks: int) -> mujoco.MjModel:
     return mjx_model.load_model("stalk_arm.xml", edit)
 
 
-def planar_position(angles: Any, numeric: Any = jnp) -> Any:
+def planar_position(angles: Any, xp: Any = jnp) -> Any:
     """Return the position [..., 2] (m) of the grip relative to the first joint, for shoulder and elbow ``angles`` [..., 2],
     rad.
     """
     first, both = angles[..., 0], angles[..., 0] + angles[..., 1]
-    x = -UPPER_ARM * numeric.sin(first) - FOREARM * numeric.sin(both)
-    return numeric.stack([x, UPPER_ARM * numeric.cos(first) + FOREARM * numeric.cos(both)], axis=-1)
+    x = -UPPER_ARM * xp.sin(first) - FOREARM * xp.sin(both)
+    return xp.stack([x, UPPER_ARM * xp.cos(first) + FOREARM * xp.cos(both)], axis=-1)
 
 
-def angles_at(position: Any, side: Any, numeric: Any = jnp) -> Any:
+def angles_at(position: Any, elbow_sign: Any, xp: Any = jnp) -> Any:
     """Return shoulder and elbow angles [..., 2] (rad) that bring the grip to ``position``.
 
     Args:
         position: [..., 2], m relative to the first joint. If it is out of reach, the arm points at it, stretched or folded.
-        side: [...], sign of the elbow angle, 1 or -1, which selects one of two solutions.
-        numeric: `jax.numpy` or `numpy`.
+        elbow_sign: [...], sign of the elbow angle, 1 or -1, which selects one of two solutions.
+        xp: `jax.numpy` or `numpy`.
     """
-    distance = numeric.linalg.norm(position, axis=-1)
+    distance = xp.linalg.norm(position, axis=-1)
     cosine = (distance**2 - UPPER_ARM**2 - FOREARM**2) / (2 * UPPER_ARM * FOREARM)
-    elbow = side * numeric.arccos(numeric.clip(cosine, -1.0, 1.0))
-    bearing = numeric.arctan2(-position[..., 0], position[..., 1])
-    between = numeric.arctan2(FOREARM * numeric.sin(elbow), UPPER_ARM + FOREARM * numeric.cos(elbow))
-    return numeric.stack([bearing - between, elbow], axis=-1)
+    elbow = elbow_sign * xp.arccos(xp.clip(cosine, -1.0, 1.0))
+    bearing = xp.arctan2(-position[..., 0], position[..., 1])
+    between = xp.arctan2(FOREARM * xp.sin(elbow), UPPER_ARM + FOREARM * xp.cos(elbow))
+    return xp.stack([bearing - between, elbow], axis=-1)
 
 
-def joints_at(target: Any, side: Any, numeric: Any = jnp) -> Any:
+def joints_at(target: Any, elbow_sign: Any, xp: Any = jnp) -> Any:
     """Return slide, shoulder and elbow positions [..., 3] (m, rad, rad) with the grip at ``target``.
 
     Args:
         target: [..., 3], m in the frame of a stand; for positions out of reach see `angles_at`.
-        side: [...], sign of the elbow angle, 1 or -1, which selects one of two solutions.
-        numeric: `jax.numpy` or `numpy`.
+        elbow_sign: [...], sign of the elbow angle, 1 or -1, which selects one of two solutions.
+        xp: `jax.numpy` or `numpy`.
     """
-    position = target[..., :2] - numeric.asarray(SHOULDER, dtype=target.dtype)
-    return numeric.concatenate([target[..., 2:], angles_at(position, side, numeric)], axis=-1)
+    position = target[..., :2] - xp.asarray(SHOULDER, dtype=target.dtype)
+    return xp.concatenate([target[..., 2:], angles_at(position, elbow_sign, xp)], axis=-1)
 
 
-def grip_at(joints: Any, numeric: Any = jnp) -> Any:
+def grip_at(joints: Any, xp: Any = jnp) -> Any:
     """Return the position [..., 3] (m, frame of a stand) of the grip for ``joints`` [..., 3]: the inverse of `joints_at`."""
-    position = planar_position(joints[..., 1:3], numeric) + numeric.asarray(SHOULDER, dtype=joints.dtype)
-    return numeric.concatenate([position, joints[..., :1]], axis=-1)
+    position = planar_position(joints[..., 1:3], xp) + xp.asarray(SHOULDER, dtype=joints.dtype)
+    return xp.concatenate([position, joints[..., :1]], axis=-1)
 
 
-def is_within(target: np.ndarray) -> np.ndarray:
+def is_reachable(target: np.ndarray) -> np.ndarray:
     """Check if the grip can reach a position within link lengths and joint limits.
 
     Args:
         target: [..., 3], m in the frame of a stand.
 
     Returns:
-        [..., 2] bool, for the elbow on side 1 and on side -1.
+        [..., 2] bool, for elbow signs 1 and -1.
     """
     target = np.asarray(target, float)
     distance = np.linalg.norm(target[..., :2] - np.array(SHOULDER), axis=-1)

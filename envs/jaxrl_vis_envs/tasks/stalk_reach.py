@@ -94,14 +94,14 @@ class _Episode(NamedTuple):
 
     Attributes:
         foot: [N, 3] float32, positions of the stalks' feet, m.
-        turn: [N, 4] float32, orientations of the stalks.
+        rotation: [N, 4] float32, orientations of the stalks: unit quaternions, scalar first.
         wind: [3] float32, heading and phase of the wind (rad) and the index of the target stalk, as `_gusts` and
             `_displacement` read them.
         height: [] float32, height of the goal, m.
     """
 
     foot: jax.Array
-    turn: jax.Array
+    rotation: jax.Array
     wind: jax.Array
     height: jax.Array
 
@@ -144,11 +144,11 @@ class StalkReach(MjxGoalEnv):
     def sample_goal(self, key: jax.Array) -> mjx.Data:
         episode = self._sample(key)
         still = jnp.zeros((self.config.stalks, 2), jnp.float32)
-        position = _along(episode.foot, episode.turn, episode.height)[episode.wind[2].astype(int)]
+        position = _rest_points(episode.foot, episode.rotation, episode.height)[episode.wind[2].astype(int)]
         return self.configuration(episode, position, still)
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
-        position = within_reach(stalk_arm.grip_at(data.ctrl) + self.config.action_scale * action)
+        position = clamp_to_workspace(stalk_arm.grip_at(data.ctrl) + self.config.action_scale * action)
         gusts = self._gusts(data.mocap_pos[self._wind])
         foot = data.mocap_pos[self._layout.mocap]
         wind = bending.wind_torque(self._model, self._layout, gusts, foot, data.time)
@@ -172,7 +172,7 @@ class StalkReach(MjxGoalEnv):
         """
         data = self._still.replace(
             mocap_pos=self._still.mocap_pos.at[self._layout.mocap].set(episode.foot).at[self._wind].set(episode.wind),
-            mocap_quat=self._still.mocap_quat.at[self._layout.mocap].set(episode.turn),
+            mocap_quat=self._still.mocap_quat.at[self._layout.mocap].set(episode.rotation),
         )
         hinges = bending.hinge_angles(self._layout, self.mj_model.nv, displacement)
         joints = stalk_arm.joints_at(grip, 1.0)
@@ -182,7 +182,7 @@ class StalkReach(MjxGoalEnv):
         """Return the displacement of the target stalk from rest at the height of the grip: [3] float32, m."""
         stalk = data.mocap_pos[self._wind][2].astype(int)
         height = data.qpos[0]
-        rest = _along(data.mocap_pos[self._layout.mocap], data.mocap_quat[self._layout.mocap], height)
+        rest = _rest_points(data.mocap_pos[self._layout.mocap], data.mocap_quat[self._layout.mocap], height)
         return (bending.at_height(data, self._layout, height) - rest)[stalk]
 
     def _gusts(self, wind: jax.Array) -> bending.Gusts:
@@ -202,29 +202,29 @@ class StalkReach(MjxGoalEnv):
         along = along - 0.5 * along[-1]
         across = config.offset * jax.random.uniform(offset_key, (count,), jnp.float32, -1.0, 1.0)
         lean = math.radians(config.lean) * jax.random.uniform(lean_key, (count, 2), jnp.float32, -1.0, 1.0)
-        turn = jax.vmap(rotations.quat_mul)(_turn(0, lean[:, 0]), _turn(1, lean[:, 1]))
+        rotation = jax.vmap(rotations.quat_mul)(_axis_quaternions(0, lean[:, 0]), _axis_quaternions(1, lean[:, 1]))
         # Stalks are at their sampled positions at `SWAY_HEIGHT`, where the arm works, and not at the ground.
         upright = jnp.stack([along, across, jnp.zeros(count)], axis=-1)
-        foot = upright.at[:, :2].add(-_along(jnp.zeros_like(upright), turn, bending.SWAY_HEIGHT)[:, :2])
+        foot = upright.at[:, :2].add(-_rest_points(jnp.zeros_like(upright), rotation, bending.SWAY_HEIGHT)[:, :2])
         stalk = jax.random.randint(stalk_key, (), 0, count).astype(jnp.float32)
         angles = jax.random.uniform(wind_key, (2,), jnp.float32, 0.0, 2 * np.pi)
         height = jax.random.uniform(height_key, (), jnp.float32, *config.goal_heights)
-        return _Episode(foot, turn, jnp.append(angles, stalk), height)
+        return _Episode(foot, rotation, jnp.append(angles, stalk), height)
 
 
-def _turn(axis: int, angle: jax.Array) -> jax.Array:
-    """Return quaternions [N, 4] of rotations by ``angle`` [N] (rad) about a coordinate axis."""
+def _axis_quaternions(axis: int, angle: jax.Array) -> jax.Array:
+    """Return quaternions [N, 4] (scalar first) of rotations by ``angle`` [N] (rad) about a coordinate axis."""
     quaternion = jnp.zeros((*angle.shape, 4), jnp.float32)
     return quaternion.at[:, 0].set(jnp.cos(0.5 * angle)).at[:, 1 + axis].set(jnp.sin(0.5 * angle))
 
 
-def _along(foot: jax.Array, turn: jax.Array, height: jax.Array | float) -> jax.Array:
+def _rest_points(foot: jax.Array, rotation: jax.Array, height: jax.Array | float) -> jax.Array:
     """Return the points [N, 3] (m, world) of stalks at rest at a ``height`` (m)."""
-    axis = jax.vmap(lambda quaternion: rotations.rotate(jnp.array([0.0, 0.0, 1.0]), quaternion))(turn)
+    axis = jax.vmap(lambda quaternion: rotations.rotate(jnp.array([0.0, 0.0, 1.0]), quaternion))(rotation)
     return foot + height / axis[:, 2:] * axis
 
 
-def within_reach(position: jax.Array) -> jax.Array:
+def clamp_to_workspace(position: jax.Array) -> jax.Array:
     """Clamp a position [3] (m, world) to the grip's workspace, in radius and bearing around the shoulder and in height."""
     shoulder = jnp.asarray(stalk_arm.SHOULDER, jnp.float32)
     offset = position[:2] - shoulder

@@ -70,36 +70,36 @@ def _lump(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     waves, phases = rng.normal(size=(6, 3)) * 2.0, rng.uniform(0.0, 2.0 * np.pi, 6)
     heights = rng.uniform(0.05, 0.15, 6)
 
-    def place(polar: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    def surface_point(polar: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
         ball = _ball(polar, azimuth)
         return ball * (1.0 + np.sin(ball @ waves.T + phases) @ heights)[:, None]
 
-    return _closed(place)
+    return _closed(surface_point)
 
 
 def _rounded_box(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Make a superellipsoid."""
     power, half = rng.uniform(0.25, 0.6), rng.uniform(0.4, 1.0, 3)
 
-    def place(polar: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    def surface_point(polar: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
         ball = _ball(polar, azimuth)
         return half * np.sign(ball) * np.abs(ball) ** power
 
-    return _closed(place)
+    return _closed(surface_point)
 
 
 def _bowl(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Make a surface of revolution: the outside of a bowl, and the inside back to the axis."""
     height, wall, lip = rng.uniform(0.5, 1.6), rng.uniform(0.75, 0.9), rng.uniform(0.8, 1.3)
 
-    def place(polar: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    def surface_point(polar: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
         outside = polar >= np.pi / 2
         along = np.where(outside, np.pi - polar, polar)  # from the axis to the rim
         scale = np.where(outside, 1.0, wall)
         radius, z = scale * np.sin(along) ** lip, np.where(outside, 0.0, 1.0 - wall) - scale * height * np.cos(along)
         return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
 
-    return _closed(place)
+    return _closed(surface_point)
 
 
 def _ring(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -120,16 +120,16 @@ def _ball(polar: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
     return np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=1)
 
 
-def _closed(place: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _closed(surface_point: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Make a surface with the topology of a ball: two poles, and rings between them.
 
     Args:
-        place: Function from polar angles and azimuths [N] to points [N, 3].
+        surface_point: Function from polar angles and azimuths [N] to points [N, 3].
     """
     polar, azimuth = np.meshgrid(
         np.pi * np.arange(1, _ALONG + 1) / (_ALONG + 1), 2.0 * np.pi * np.arange(_AROUND) / _AROUND, indexing="ij"
     )
-    points = place(np.array([0.0, *polar.ravel(), np.pi]), np.array([0.0, *azimuth.ravel(), 0.0]))
+    points = surface_point(np.array([0.0, *polar.ravel(), np.pi]), np.array([0.0, *azimuth.ravel(), 0.0]))
     row, column = np.indices((_ALONG - 1, _AROUND)).reshape(2, -1)
     right = (column + 1) % _AROUND
     corners = [1 + a * _AROUND + b for a, b in ((row, column), (row + 1, column), (row + 1, right), (row, right))]

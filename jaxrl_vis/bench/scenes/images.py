@@ -30,7 +30,7 @@ ACCELERATOR_COUNTS = (4096,)
 SCENE_CPU_COUNTS = {"clutter": (4,)}  # one of each camera, of which each takes a second
 SCENE_ACCELERATOR_COUNTS = {"primitives": (8192,), "clutter": (8192,)}
 CAMERAS = {"clutter": 4}
-"""Cameras that a scene is seen by, from the first; one if not listed."""
+"""Number of cameras that view a scene, starting with its first; one if not listed."""
 OUTPUTS = ("rgbd", "rgbd8", "depth")
 MESH_OUTPUTS = ("rgbds", "rgbd", "depth")  # as the scenes of meshes that MuJoCo Warp publishes figures of: with labels
 _SAMPLE = 32  # number of poses over which the needed tests are averaged
@@ -62,7 +62,7 @@ class Case:
     Attributes:
         config: Entries of a record: scene, poses, textures, highlights, image_size, images; shadows and cameras if there are
             shadows, or several cameras.
-        mj_model: Model, seen by its first cameras.
+        mj_model: Model; its first cameras are used.
         batches: Two sets of poses, see `models.random_poses`; the first `worlds` of each are rendered.
     """
 
@@ -82,7 +82,7 @@ class Case:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Outputs to measure, of which a peer has the first. Depths alone have no shadows."""
+        """Outputs to measure; peers render the first. Depth alone is omitted with shadows, which it does not show."""
         outputs = MESH_OUTPUTS if self.config.get("scene") in models.MESH_SCENES else OUTPUTS
         return tuple(output for output in outputs if output != "depth" or not self.config.get("shadows"))
 
@@ -103,7 +103,7 @@ def cases(scene: str, settings: Settings, sizes: tuple[int, ...], min_poses: int
             continue
         spread = models.SPREADS[variant["poses"]]
         counts = (SCENE_CPU_COUNTS.get(scene, CPU_COUNTS), SCENE_ACCELERATOR_COUNTS.get(scene, ACCELERATOR_COUNTS))
-        for count in settings.counts(*counts):
+        for count in settings.batch_sizes(*counts):
             worlds = -(-count // cameras)
             batches = [models.random_poses(mj_model, max(worlds, min_poses), seed, spread) for seed in (1, 2)]
             for size in sizes:
@@ -137,7 +137,7 @@ def draw_all(case: Case, scene: Scene, poses: dict[str, jax.Array], draw: Callab
         case: The case.
         scene: From `make_scene`.
         poses: Poses of the batch, [worlds, ...].
-        draw: Function from a scene and poses to arrays of one image.
+        draw: Function from a scene and the poses of one world to the arrays of one image.
 
     Returns:
         The arrays, [worlds, ...], or [worlds * cameras, ...] by pose and then by camera.
@@ -179,24 +179,24 @@ def measure_output(case: Case, output: str, repeats: int) -> Measurement:
     batches = [{name: jnp.asarray(rows[: case.worlds]) for name, rows in batch.items()} for batch in case.batches]
 
     # Tables of thousands of triangles are no constants of a program, unlike all that a scene without them has.
-    given = None if scene.hierarchies is None else scene
+    scene_argument = None if scene.hierarchies is None else scene
 
-    def draw(given: Scene | None, poses: dict[str, jax.Array]) -> Any:
-        return draw_all(case, given or scene, poses, lambda scene, poses: _image(scene, poses, output))
+    def draw(scene_argument: Scene | None, poses: dict[str, jax.Array]) -> Any:
+        return draw_all(case, scene_argument or scene, poses, lambda scene, poses: _image(scene, poses, output))
 
-    program, compile_s = compile_timed(jaxrl_vis_envs.jit(draw), given, batches[0])
-    compiled = functools.partial(program, given)
+    program, compile_s = compile_timed(jaxrl_vis_envs.jit(draw), scene_argument, batches[0])
+    compiled = functools.partial(program, scene_argument)
     assert_new_images(compiled, batches)
     timing = measure_time(alternate(compiled, batches), repeats)
     sample = {name: rows[:_SAMPLE] for name, rows in case.batches[0].items()}
     tests = models.needed_tests(mj_model, sample, size)
     pixel_operations = operations.operations_per_pixel(scene, tests, coloured=output != "depth")
-    details = _effort(program, count * size * size, timing.median_s, float(np.sum(tests)), pixel_operations)
+    details = _cost_details(program, count * size * size, timing.median_s, float(np.sum(tests)), pixel_operations)
     details["drawn"] = len(scene.object_ids)
     return Measurement("render/scene", count / timing.median_s, "images/s", config, timing.details(compile_s, **details))
 
 
-def _effort(compiled: Any, pixels: int, seconds: float, tests: float, pixel_operations: float | None) -> dict[str, Any]:
+def _cost_details(compiled: Any, pixels: int, seconds: float, tests: float, pixel_operations: float | None) -> dict[str, Any]:
     """Return the details of a measurement's cost: ray-geom tests, operations, and memory.
 
     Args:

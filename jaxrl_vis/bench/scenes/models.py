@@ -28,12 +28,12 @@ def load(scene: str, textures: bool = True, highlights: bool = True, shadows: bo
         scene: ``finger`` (from the dm_control suite), ``fetch_reach`` (ours), ``primitives`` (127 mixed primitives on and
             over a table), ``clutter`` (500 meshes), one of `packaged.PACKAGED` (robots with the meshes of their packages), or
             the path of an MJCF file with a camera.
-        textures: Whether to keep the textures of materials and sky.
-        highlights: Whether to keep the specular component of lights.
-        shadows: Whether lights that cast shadows keep doing so.
+        textures: Keep the textures of materials and sky.
+        highlights: Keep the specular component of lights.
+        shadows: Keep the shadows of lights that cast any.
 
     Raises:
-        RequestError: The scene is unknown, its package is missing, or it has no camera.
+        RequestError: The scene is unknown, its package is missing, its file is not a model, or it has no camera.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # MuJoCo's warnings about third-party models
@@ -126,7 +126,8 @@ def scatter_joints(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.ran
     """Set every joint to a random position, in place, without running the kinematics.
 
     Hinges and slides are uniform within their limits (hinges without: any angle; slides without: 0.3 m each way), balls turn by
-    up to a radian, free bodies move by a tenth of the model's extent (0.2 m at most) and turn by up to half a radian.
+    up to a radian, free bodies move along each axis by up to a tenth of the model's extent (0.2 m at most) and turn by up to
+    half a radian.
 
     Args:
         mj_model: Model.
@@ -163,7 +164,7 @@ def _rotate_randomly(quaternions: np.ndarray, max_angle: float, rng: np.random.G
 
 
 def forward(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
-    """Compute the inputs of rendering: poses of bodies, geoms, sites, cameras, lights and tendons, and tendon limits."""
+    """Compute the inputs of rendering in ``mj_data``: poses of bodies, geoms, sites, cameras, lights, tendons, and limits."""
     mujoco.mj_kinematics(mj_model, mj_data)
     mujoco.mj_comPos(mj_model, mj_data)
     mujoco.mj_camlight(mj_model, mj_data)

@@ -11,12 +11,12 @@ from jaxrl_vis.errors import RequestError
 
 
 class _Source(NamedTuple):
-    """Model of a package, and the free camera that its environment looks through, as an `mujoco.MjvCamera` has it.
+    """MuJoCo model in a package, and the free camera of its environment, with the parameters of `mujoco.MjvCamera`.
 
     Attributes:
-        package: Package, as it is imported; pip's name has hyphens.
+        package: Import name of the package; its name for pip has hyphens.
         path: Path of the MJCF file in the package.
-        lookat: Point in the middle of the image, m.
+        lookat: Point at the centre of the image, m.
         distance: Distance of the camera from it, m.
         azimuth, elevation: Direction of view, degrees.
     """
@@ -40,7 +40,9 @@ PACKAGED = tuple(_SOURCES)
 
 
 def packaged_spec(scene: str) -> mujoco.MjSpec:
-    """Read a robot, and give it a first camera ``bench`` that sees it as its environment does.
+    """Return the spec of a packaged robot whose first camera, ``bench``, has the view of the free camera of its environment.
+
+    It replaces the cameras of the world.
 
     Args:
         scene: One of `PACKAGED`.

@@ -8,7 +8,7 @@ from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code, read_che
 from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.cli.trained.options import CheckpointOption, TrustOption
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run.trained.shipped import workplace
+from jaxrl_vis.run.trained.shipped import output_folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +42,9 @@ def run(options: Play) -> int:
     trust = may_run_code(run_dir, options.trust)
     if options.live:
         return _play_live(run_dir, options, checkpoint, trust)
-    out = options.out or workplace(run_dir) / ("play.html" if options.html else "play_aux.gif" if options.aux else "play.gif")
+    out = options.out or output_folder(run_dir) / (
+        "play.html" if options.html else "play_aux.gif" if options.aux else "play.gif"
+    )
     from jaxrl_vis.run.trained import play_auxiliary, restored_run
 
     if options.aux:
@@ -68,7 +70,7 @@ def _play_live(run_dir: Path, options: Play, checkpoint: int | Literal["best"] |
     from jaxrl_vis.run.trained.policy import load_policy
 
     live.require()
-    out = options.out or workplace(run_dir) / "live.gif"
+    out = options.out or output_folder(run_dir) / "live.gif"
     videos.check_output(out)
     live.play_live(load_policy(run_dir, checkpoint=checkpoint, trust=trust), run_dir.resolve().name, out)
     return 0

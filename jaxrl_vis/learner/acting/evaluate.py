@@ -19,9 +19,10 @@ class Evaluation(NamedTuple):
     """Result of an evaluation.
 
     Attributes:
-        metrics: [S] float32 by name.
+        metrics: [S] float32 by name: means over all episodes, as ``eval/`` and a name of `GoalEnv.metric_names`, and
+            ``eval/goal_distance_median``.
         recording: ``frames`` [S, K, T+1, ...], ``goals`` [S, K, ...] and ``success`` [S, K] of the first K episodes of each
-            seed.
+            shard of each seed (`num_recorded`).
     """
 
     metrics: Metrics
@@ -40,7 +41,7 @@ def summarize(
 
     Args:
         outcome: [S, N] by name, metrics (`GoalEnv.metric_names`) of all N episodes at their last steps.
-        observations: [S, K, T+2, ...] of the recorded episodes, followed by the goal's.
+        observations: [S, K, T+2, ...], the T+1 observations of each recorded episode, followed by its goal.
         success: [S, at least K] success of the recorded episodes and possibly more.
         frame_stack: Number of images that an observation stacks.
         xp: ``jax.numpy`` or ``numpy``, according to the type of the arrays.

@@ -27,7 +27,7 @@ class Exploration(NamedTuple):
     """Exploration noise of actions; none by default.
 
     Attributes:
-        random_action_probability: Fraction of action vectors replaced by uniformly sampled ones.
+        random_action_probability: Probability that an action vector is replaced by a uniformly sampled one.
         action_noise: Standard deviation of the Gaussian noise on the others.
     """
 
@@ -114,9 +114,9 @@ class Rollout(NamedTuple):
     record: Any
 
 
-def _episode_major(*parts: jax.Array) -> jax.Array:
-    """Move the time axis behind the episodes: [T, S, K, ...] -> [S, K, T, ...]."""
-    return jnp.moveaxis(jnp.concatenate(parts), 0, 2)
+def _episode_major(*arrays: jax.Array) -> jax.Array:
+    """Concatenate arrays [steps, S, K, ...] along time, and move that axis behind the episodes: [S, K, all steps, ...]."""
+    return jnp.moveaxis(jnp.concatenate(arrays), 0, 2)
 
 
 def play(

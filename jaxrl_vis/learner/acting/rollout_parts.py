@@ -22,8 +22,8 @@ from jaxrl_vis_envs.base import GoalEnv
 PART_SIZE = 8
 """Maximum number of environments in a part: as many float32 numbers as fit into a vector register of most CPUs."""
 
-Played = tuple[Episodes, Metrics]
-"""Episodes [S, P, ...], and ``success`` and ``goal_distance`` at their last steps, [S, P] float32."""
+PartResult = tuple[Episodes, Metrics]
+"""Episodes [S, P, ...] of one part, and their metrics (`GoalEnv.metric_names`) at the last step, [S, P] float32 by name."""
 
 
 def part_size(num_envs: int) -> int:
@@ -61,7 +61,12 @@ class RolloutPart:
     total: int
 
     def draw(self, draw: Callable[[tuple[int, ...]], jax.Array], shape: tuple[int, ...]) -> jax.Array:
-        """Sample numbers for all environments, and return those of this part, of ``shape``; padded with zeros."""
+        """Sample numbers for all environments, and return those of this part, [P, ...] of ``shape``; padded with zeros.
+
+        Args:
+            draw: shape -> random numbers, with a key that all parts share.
+            shape: Shape of the result; the first axis is that of environments.
+        """
         drawn = draw((self.total, *shape[1:]))
         filled = jnp.concatenate([drawn, jnp.zeros(shape, drawn.dtype)])  # the last part may be longer than what is left
         return jax.lax.dynamic_slice_in_dim(filled, self.first, shape[0])
@@ -71,11 +76,11 @@ class RolloutPart:
         return jax.random.normal(jax.random.fold_in(key, self.first), shape)
 
     def split(self, key: jax.Array, count: int) -> jax.Array:
-        """Return this part's slice of the keys that `jax.random.split` returns for all environments."""
+        """Return this part's slice [count] of the typed keys that `jax.random.split` returns for all environments."""
         return jax.vmap(jax.random.fold_in, (None, 0))(key, self.first + jnp.arange(count))
 
 
-def played_spec(env: GoalEnv, size: int, seeds: int, full_state_size: int = 0) -> Played:
+def part_result_spec(env: GoalEnv, size: int, seeds: int, full_state_size: int = 0) -> PartResult:
     """Return shapes and dtypes of the result of one part, without tracing its program.
 
     Args:

@@ -40,7 +40,8 @@ def make(names: Sequence[str], spec: Spec, folder: str | None = None) -> dict[st
         folder: Folder from which modules are imported first.
 
     Raises:
-        RequestError: A name is unknown or occurs twice, or observations are not images.
+        RequestError: A name is unknown or occurs twice, a function does not return an `AuxTask`, two tasks have the same
+            `AuxTask.name`, or observations are not images.
     """
     makers = [find("auxiliary task", name, _MAKERS, folder) for name in names]
     for name in names:
@@ -52,8 +53,8 @@ def make(names: Sequence[str], spec: Spec, folder: str | None = None) -> dict[st
             f"auxiliary tasks ({', '.join(names)}) train an encoder of images, and here observations are states of "
             f"{shape[0]} numbers: choose a task that shows images (its name begins with Visual), or no auxiliary tasks"
         )
-    made = [call("auxiliary task", name, maker, spec, of=AuxTask) for name, maker in zip(names, makers)]
-    tasks = {task.name: task for task in made}
-    if len(tasks) < len(made):
-        raise RequestError(f"two auxiliary tasks call themselves alike ({', '.join(task.name for task in made)}): rename one")
+    built = [call("auxiliary task", name, maker, spec, of=AuxTask) for name, maker in zip(names, makers)]
+    tasks = {task.name: task for task in built}
+    if len(tasks) < len(built):
+        raise RequestError(f"two auxiliary tasks call themselves alike ({', '.join(task.name for task in built)}): rename one")
     return tasks

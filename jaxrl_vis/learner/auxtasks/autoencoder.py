@@ -10,10 +10,10 @@ from jaxrl_vis.types import Params
 
 
 def make(spec: Spec) -> AuxTask:
-    """Build the task.
+    """Build the autoencoder task.
 
-    As in the authors' release (``spec.options.in_grey``), one grey channel of the newest image is reconstructed rather than all
-    channels of the observation. Here it is the luminance of the normalised channels; the release normalises again.
+    With ``spec.options.in_grey``, as in the authors' release, one grey channel of the newest image is reconstructed rather than
+    all channels of the observation. Here it is the luminance of the normalised channels; the release normalises again.
     """
     in_grey = spec.options.in_grey
     channels, height, width = spec.observation.shape

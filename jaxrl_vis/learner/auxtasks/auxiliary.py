@@ -47,12 +47,15 @@ class Auxiliary:
 
     @property
     def encoded(self) -> tuple[str, ...]:
-        """Observations encoded with gradient, in addition to those before the action and goals: ``after``, names of views."""
+        """Names of the observations to encode with gradient besides ``before`` and ``goal``, as in `Inputs.pieces`.
+
+        ``after`` if a task reads ``latent_tp1``, then the name of each task that has images of its own (`AuxTask.view`).
+        """
         after = ("after",) if any("latent_tp1" in task.needs for task in self.tasks.values()) else ()
         return (*after, *(name for name, task in self.tasks.items() if task.view is not None))
 
     def init_heads(self, key: jax.Array) -> dict[str, Params]:
-        """Initialise the parameters of all heads, by task."""
+        """Initialise the parameters of all heads, by task, from a typed key []."""
         return {name: task.init(task.fold(key)) for name, task in self.tasks.items()}
 
     def init_state(self, critic: Params, key: jax.Array) -> WeightingState | None:
@@ -68,12 +71,16 @@ class Auxiliary:
         return state if state.key is None else state.replace(key=jax.random.fold_in(key, _DRAWS))
 
     def start(self, critic: Params) -> WeightingState:
-        """Return the weighting's state before the first update."""
-        held = (critic,) if self.weighting.hold is not None else ()
-        return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *held)
+        """Return the weighting's own initial state, with the same key for every learner, if it has one.
+
+        Args:
+            critic: All parameters of the critic.
+        """
+        params = (critic,) if self.weighting.hold is not None else ()
+        return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *params)
 
     def with_stored(self, episodes: Episodes) -> Episodes:
-        """Add the arrays that tasks compute once per episode to a rollout's episodes."""
+        """Return the E episodes of a rollout with the arrays that tasks compute once per episode (`AuxTask.episode`)."""
         images, stored = episodes.observations[:, :-1], {}
         for name, task in self.tasks.items():
             if task.episode is not None:
@@ -91,7 +98,7 @@ class Auxiliary:
         return {name: jax.eval_shape(task.episode, images) for name, task in self.tasks.items() if task.episode is not None}
 
     def with_targets(self, key: jax.Array, batch: Batch, stored: dict[str, jax.Array]) -> Batch:
-        """Add the views and targets of all tasks to a batch.
+        """Return a batch with the views and targets of all tasks added.
 
         Args:
             key: [] typed key for random views.
@@ -161,7 +168,7 @@ class Auxiliary:
 
 
 def _scale_latents(view: View, weight: jax.Array) -> View:
-    """Multiply the gradient with respect to a view's latents by ``weight``, leaving the latents unchanged."""
+    """Multiply the gradient with respect to a view's latents by ``weight`` [], leaving the latents unchanged."""
     names = ("latent_t", "latent_tp1", "latent_view")
     latents = {name: getattr(view, name) for name in names if getattr(view, name) is not None}
     return view.replace(**{name: _scale_gradient(latent, weight) for name, latent in latents.items()})
@@ -196,10 +203,11 @@ def make_auxiliary(
         dtype: Compute dtype of the networks.
 
     Raises:
-        RequestError: Tasks and weighting are incompatible with each other or with the rest of the configuration.
+        RequestError: A task or the weighting is unknown, or they are incompatible with each other or with the rest of the
+            configuration.
     """
     if config.auxiliary.weighting in WEIGHTINGS:
-        weighting = _bound_strength(config, make_weighting(config.auxiliary.weighting, **_options(config)))
+        weighting = _limit_weights(config, make_weighting(config.auxiliary.weighting, **_options(config)))
     else:
         maker = find("weighting", config.auxiliary.weighting, WEIGHTINGS, config.environment.env_folder)
         weighting = call("weighting", config.auxiliary.weighting, maker, of=Weighting)
@@ -231,8 +239,8 @@ def make_auxiliary(
     return Auxiliary(auxtasks.make(config.auxiliary.aux_tasks, spec, config.environment.env_folder), weighting, gradient_mode)
 
 
-def _bound_strength(config: Config, weighting: Weighting) -> Weighting:
-    """Bound and scale the weights as configured. OL-AUX applies the maximum weight in its own rule."""
+def _limit_weights(config: Config, weighting: Weighting) -> Weighting:
+    """Limit the weights, or fix their sum, as configured. OL-AUX applies the maximum weight in its own rule."""
     maximum, total = config.study.weighting_maximum, config.study.weighting_total
     if config.auxiliary.weighting == "ol_aux":
         maximum = None
@@ -240,7 +248,7 @@ def _bound_strength(config: Config, weighting: Weighting) -> Weighting:
 
 
 def _options(config: Config) -> dict[str, Any]:
-    """Return the arguments for the constructor of the configuration's weighting.
+    """Return the keyword arguments for the constructor of the configuration's weighting.
 
     Raises:
         RequestError: The number of values of eps differs from the number of tasks.

@@ -14,7 +14,7 @@ MAX_ANGLE = math.radians(30.0)
 
 
 def make(spec: Spec) -> AuxTask:
-    """Build the task. With ``spec.options.max_shift``, it predicts the shift as well as the angle."""
+    """Build the egomotion task. With ``spec.options.max_shift``, it predicts the shift as well as the angle."""
     options = spec.options
 
     def predict(params: Params, view: View) -> jax.Array:
@@ -34,7 +34,7 @@ def make(spec: Spec) -> AuxTask:
 def egomotion_pair(
     key: jax.Array, images: jax.Array, border: Border = "clip", max_shift: float = 0.0
 ) -> tuple[jax.Array, jax.Array]:
-    """Rotate images by random angles, uniform up to 30 degrees either way, and optionally shift them.
+    """Rotate images by random angles, uniform up to 30 degrees in either direction, and optionally shift them.
 
     Args:
         key: [] typed key.
@@ -64,7 +64,7 @@ def rotate(images: jax.Array, angle: jax.Array, shift: jax.Array, border: Border
     height, width = images.shape[-2:]
     last_x, last_y = width - 1.0, height - 1.0
 
-    def one(words: jax.Array, angle: jax.Array, shift: jax.Array) -> jax.Array:
+    def rotate_one(words: jax.Array, angle: jax.Array, shift: jax.Array) -> jax.Array:
         cos, sin = jnp.cos(angle), jnp.sin(angle)
         zoom = jnp.float32(1.0)
         if border == "clip":
@@ -79,5 +79,5 @@ def rotate(images: jax.Array, angle: jax.Array, shift: jax.Array, border: Border
         return jnp.where(is_inside, read_words_between(words, x, y), jnp.uint32(0))
 
     # The barrier keeps the compiler from recomputing a word for each of its bytes.
-    words = jax.lax.optimization_barrier(jax.vmap(one)(to_words(images), angle, shift))
+    words = jax.lax.optimization_barrier(jax.vmap(rotate_one)(to_words(images), angle, shift))
     return from_words(words, images.shape[1])

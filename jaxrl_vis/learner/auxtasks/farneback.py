@@ -13,8 +13,8 @@ products with small constant matrices, L @ image @ R, into which successive step
 smoothed, resized and expanded at once. Images are small, so multiplying the zeros of these matrices is cheaper than convolving.
 
 Details that the paper leaves open follow OpenCV's ``calcOpticalFlowFarneback``, with whose flow this agrees: borders are
-reflected for smoothing and replicated for the fit, pixels near a border get lower weights, no level of the pyramid is smaller
-than 32 pixels, and the determinant of the equations is regularised by 0.001. The effect of this depends on the unit of the grey
+reflected for smoothing and replicated for the fit, pixels near a border get lower weights, pyramid levels below 32 pixels are
+omitted, and the determinant of the equations is regularised by 0.001. The effect of this depends on the unit of the grey
 levels: negligible for 0 to 255; for 0 to 1, less than 0.001 pixels of the flow remain in our images.
 """
 
@@ -67,17 +67,18 @@ def flow(images_t: jax.Array, images_tp1: jax.Array, settings: Settings = Settin
         settings: Window, pyramid, iterations.
     """
     expand = jax.vmap(functools.partial(_expansions, settings=settings))
-    return _interpolate_planes(expand(images_t), expand(images_tp1), settings)
+    return _displacements_between(expand(images_t), expand(images_tp1), settings)
 
 
 def flow_along(images: jax.Array, settings: Settings = Settings()) -> jax.Array:
     """Compute `flow` between successive images, [T + 1, H, W] -> [T, H, W, 2], expanding each image only once."""
     expansions = jax.vmap(functools.partial(_expansions, settings=settings))(images)
     before, after = (jax.tree.map(lambda plane, part=part: plane[part], expansions) for part in (slice(-1), slice(1, None)))
-    return _interpolate_planes(before, after, settings)
+    return _displacements_between(before, after, settings)
 
 
-def _interpolate_planes(before: list[Planes], after: list[Planes], settings: Settings) -> jax.Array:
+def _displacements_between(before: list[Planes], after: list[Planes], settings: Settings) -> jax.Array:
+    """Compute displacements [B, H, W, 2] (right, down) between images with expansions ``before`` and ``after`` [B, ...]."""
     displace = functools.partial(_displacements, settings=settings)
     return jnp.stack(jax.vmap(displace)(before, after), axis=-1)
 
@@ -136,7 +137,7 @@ def _filter(size: int, taps: np.ndarray, border: str) -> np.ndarray:
 
 
 def _gaussian(radius: int, sigma: float) -> np.ndarray:
-    """Return Gaussian weights at -radius, ..., radius, normalised to a sum of 1."""
+    """Return Gaussian weights [2 radius + 1] at -radius, ..., radius, normalised to a sum of 1."""
     weights = np.exp(-0.5 * np.square(np.arange(-radius, radius + 1) / sigma))
     return weights / weights.sum()
 

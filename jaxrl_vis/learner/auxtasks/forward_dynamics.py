@@ -8,10 +8,10 @@ from jaxrl_vis.types import Params
 
 
 def make(spec: Spec) -> AuxTask:
-    """Build the task.
+    """Build the forward-dynamics task.
 
     With ``spec.options.detach`` no gradient flows through the next latent. In the authors' release it does, so that the encoder
-    can reduce the loss by making all latents alike.
+    can reduce the loss by making all latents equal.
     """
     detach = spec.options.detach
 

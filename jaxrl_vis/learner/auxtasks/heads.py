@@ -23,7 +23,10 @@ _CHANNELS, _FINEST_CHANNELS = 64, 16
 
 
 def init_linear(key: jax.Array, inputs: int, outputs: int) -> Params:
-    """Initialise `linear`; the name ``output``, as for all last layers, keeps it in float32 (`Networks.compute_copy`)."""
+    """Initialise the parameters of `linear`: a kernel [inputs, outputs] (Glorot) and a bias of zeros, float32.
+
+    They are called ``output``, like all last layers, which keeps them in float32 (`Networks.compute_copy`).
+    """
     return {"output": {"kernel": _glorot(key, (inputs, outputs)), "bias": jnp.zeros((outputs,))}}
 
 
@@ -34,7 +37,7 @@ def linear(params: Params, *inputs: jax.Array) -> jax.Array:
 
 
 def init_decoder(key: jax.Array, inputs: int, shape: tuple[int, int, int], levels: int) -> Params:
-    """Initialise `decode`.
+    """Initialise the parameters of `decode`: Glorot kernels and biases of zeros, float32, by layer.
 
     Args:
         key: [] typed key.
@@ -63,7 +66,7 @@ def decode(params: Params, values: jax.Array, dtype: Any) -> jax.Array:
         dtype: Dtype of the computation.
     """
     layers = _layers(params)
-    pixels = _through(layers, values, dtype) + layers[-1]["bias"].astype(dtype)
+    pixels = _apply_layers(layers, values, dtype) + layers[-1]["bias"].astype(dtype)
     size = 4 ** (len(layers) - 1) * pixels.shape[-1]
     return pixels.reshape(values.shape[0], -1, size).astype(jnp.float32)
 
@@ -78,7 +81,7 @@ def decoding_error(params: Params, values: jax.Array, patches: jax.Array, dtype:
         dtype: Dtype of the computation.
     """
     *coarser, before, finer, finest = _layers(params)
-    cells = _through([*coarser, before], values, dtype)
+    cells = _apply_layers([*coarser, before], values, dtype)
     weights = decoder_kernel.make_weights(before["bias"], finer, finest)
     pixels = cells.shape[0] * 16 * finest["bias"].shape[0]
     return decoder_kernel.squared_error(cells, patches.reshape(-1, patches.shape[-1] // 4), weights, 1.0 / pixels)
@@ -97,7 +100,7 @@ def _layers(params: Params) -> list[Params]:
     return [params["dense"], *(params[f"up_{level}"] for level in range(len(params) - 1))]
 
 
-def _through(layers: list[Params], values: jax.Array, dtype: Any) -> jax.Array:
+def _apply_layers(layers: list[Params], values: jax.Array, dtype: Any) -> jax.Array:
     """Return the output of the last layer before its bias is added: [.., outputs of a pixel], in ``dtype``."""
     for number, layer in enumerate(layers):
         if number > 0:

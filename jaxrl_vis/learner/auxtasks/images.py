@@ -41,14 +41,14 @@ def read_planes_between(planes: Sequence[jax.Array], x: jax.Array, y: jax.Array)
 
 
 def _neighbours(height: int, width: int, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the index of the upper left of the four pixels around each point, and the offsets right and down from it."""
+    """Return the flat index of the upper left of four pixels around each point [...], and offsets right and down from it."""
     x, y = jnp.clip(x, 0.0, width - 1.0), jnp.clip(y, 0.0, height - 1.0)
     left, top = jnp.clip(jnp.floor(x), 0, width - 2), jnp.clip(jnp.floor(y), 0, height - 2)
     return (top * width + left).astype(jnp.int32), x - left, y - top
 
 
 def _interpolate(pixel: Callable[[int], jax.Array], width: int, right: jax.Array, down: jax.Array) -> jax.Array:
-    """Interpolate linearly between four pixels, at an offset from the upper left one."""
+    """Interpolate bilinearly between four pixels; ``pixel`` returns values at an index relative to the upper left one."""
     upper = (1.0 - right) * pixel(0) + right * pixel(1)
     lower = (1.0 - right) * pixel(width) + right * pixel(width + 1)
     return (1.0 - down) * upper + down * lower

@@ -8,7 +8,7 @@ from jaxrl_vis.types import Params
 
 
 def make(spec: Spec) -> AuxTask:
-    """Build the task."""
+    """Build the inverse-dynamics task."""
 
     def predict(params: Params, view: View) -> jax.Array:
         return heads.linear(params, view.latent_t, read(view, "latent_tp1"))

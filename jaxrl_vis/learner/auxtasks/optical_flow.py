@@ -6,27 +6,31 @@ import jax.numpy as jnp
 from jaxrl_vis.learner.auxtasks import farneback, heads
 from jaxrl_vis.learner.auxtasks.images import grey
 from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
-from jaxrl_vis.learner.networks.blocks import from_blocks, shifted, to_blocks
+from jaxrl_vis.learner.networks.blocks import from_blocks, shift_images, to_blocks
 from jaxrl_vis.learner.networks.kernels.patches import to_patches
 from jaxrl_vis.types import Params
 
 
 def make(spec: Spec) -> AuxTask:
-    """Build the task. The flow is computed once per episode, as it takes longer than the rest of a gradient step."""
+    """Build the optical-flow task.
+
+    The flow is computed once per episode, as it takes longer than the rest of a gradient step. With ``spec.options.stretch``,
+    as in the authors' release, each flow image is stretched to [0, 1] (`flow_strength`).
+    """
     stretch = spec.options.stretch
     _, height, width = spec.observation.shape
     size = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
 
-    def both(view: View) -> jax.Array:
+    def both_latents(view: View) -> jax.Array:
         return jnp.concatenate([view.latent_t, read(view, "latent_tp1")], axis=-1)
 
     def decode(params: Params, view: View) -> jax.Array:
-        return heads.decode(params, both(view), spec.dtype)
+        return heads.decode(params, both_latents(view), spec.dtype)
 
     def loss(params: Params, view: View) -> jax.Array:
         if view.patches is not None and heads.has_kernel(view.latent_t.shape[0], (1, height, width), spec.levels):
             patches = to_patches(read(view, "target")[:, None].astype(spec.dtype), spec.levels)
-            return heads.decoding_error(params, both(view), patches, spec.dtype)
+            return heads.decoding_error(params, both_latents(view), patches, spec.dtype)
         return mean_squared_error(decode(params, view), to_blocks(read(view, "target")[:, None], spec.levels))
 
     return AuxTask(
@@ -37,7 +41,7 @@ def make(spec: Spec) -> AuxTask:
         loss=loss,
         episode=lambda images: to_bytes(flow_strength_along(images, spec.frame_stack, stretch), stretch),
         target=lambda batch: from_bytes(batch.stored, stretch),
-        shift=lambda flow, pixels: shifted(flow[:, None], pixels)[:, 0],
+        shift=lambda flow, pixels: shift_images(flow[:, None], pixels)[:, 0],
         number=4,
     )
 
@@ -46,12 +50,12 @@ _BYTES_PER_PIXEL, _MAX_BYTE = 16.0, 255.0
 
 
 def to_bytes(strength: jax.Array, stretch: bool = False) -> jax.Array:
-    """Quantize strengths [...] for the replay: uint8, in steps of 1/16 pixel up to 15.9; stretched masks in 255 steps."""
+    """Quantize flow magnitudes [...] for the replay: uint8, in steps of 1/16 pixel up to 15.9; stretched ones in 255 steps."""
     return jnp.clip(jnp.round(strength * _scale(stretch)), 0.0, _MAX_BYTE).astype(jnp.uint8)
 
 
 def from_bytes(flow: jax.Array, stretch: bool = False) -> jax.Array:
-    """Invert `to_bytes`, up to rounding: [...] float32."""
+    """Invert `to_bytes` with the same ``stretch``, up to rounding: [...] uint8 -> [...] float32."""
     return flow.astype(jnp.float32) / _scale(stretch)
 
 
@@ -66,16 +70,17 @@ def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int =
         images_t: [B, C, H, W] uint8, observations before the action.
         images_tp1: [B, C, H, W] uint8, observations after the action.
         frame_stack: Number of images that an observation stacks; the newest ones are used.
-        stretch: Whether to stretch each mask to [0, 1], as in the authors' release, whose grey levels also lie in [0, 1]. This
-            discards speeds, and amplifies rounding errors if nothing moves. At such grey levels, Farneback's regularisation
-            dominates (`farneback`), so that the sharpness of edges matters more than their speed.
+        stretch: Whether to stretch each flow image linearly to [0, 1], instead of pixels, as in the authors' release, whose
+            grey levels also lie in [0, 1]. This discards speeds, and amplifies rounding errors if nothing moves. At such grey
+            levels, Farneback's regularisation dominates (`farneback`), so that the sharpness of edges matters more than their
+            speed.
     """
     unit = _unit(stretch)
     return _strength(farneback.flow(grey(images_t, frame_stack) / unit, grey(images_tp1, frame_stack) / unit), stretch)
 
 
 def flow_strength_along(images: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:
-    """Compute `flow_strength` between successive images: [T + 1, C, H, W] -> [T, H, W] float32."""
+    """Compute `flow_strength` between successive images: [T + 1, C, H, W] -> [T, H, W] float32; options as there."""
     return _strength(farneback.flow_along(grey(images, frame_stack) / _unit(stretch)), stretch)
 
 

@@ -34,7 +34,7 @@ class Options:
         border: Treatment of the empty corners of a rotated image.
         max_shift: Maximum shift applied after a rotation, as a fraction of the image's size.
         in_grey: Whether the autoencoder reconstructs one grey channel rather than the observation.
-        stretch: Whether each mask of optical flow is stretched to [0, 1], rather than being in pixels.
+        stretch: Whether the magnitude of the optical flow is stretched to [0, 1] in each image, rather than being in pixels.
     """
 
     detach: bool = True
@@ -128,8 +128,8 @@ class AuxTask(NamedTuple):
         target: Transitions -> target, for tasks without ``view``.
         shift: (target, [B, 2] int32 pixels) -> target for images shifted by this down and to the right; None if the target does
             not change.
-        number: uint32, folded into the task's random keys, so that its samples do not depend on the other tasks; None for a
-            digest of the name.
+        number: Integer (uint32) folded into the task's random keys, so that its samples do not depend on the other tasks; None
+            for a digest of the name.
         draws_unfolded: Whether ``view`` uses the batch's own key, which only one task may do.
     """
 
@@ -146,7 +146,7 @@ class AuxTask(NamedTuple):
     draws_unfolded: bool = False
 
     def fold(self, key: jax.Array) -> jax.Array:
-        """Derive the task's own key."""
+        """Derive the task's own key from a key that all tasks share, [] each."""
         return jax.random.fold_in(key, zlib.crc32(self.name.encode()) if self.number is None else self.number)
 
 

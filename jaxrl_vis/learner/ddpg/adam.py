@@ -29,7 +29,7 @@ def count(state: Any) -> jax.Array:
 
 
 def with_count(state: Any, steps: jax.Array) -> Any:
-    """Return the state with another `count`."""
+    """Return the state with its `count` replaced by ``steps``, [] int32."""
     return (state[0]._replace(count=steps), *state[1:])
 
 

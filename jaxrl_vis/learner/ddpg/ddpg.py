@@ -64,7 +64,7 @@ class Agent(Replaceable):
     reward_model: Any = None
 
 
-class Working(NamedTuple):
+class WorkingState(NamedTuple):
     """Agent between two gradient steps of one iteration.
 
     Attributes:
@@ -80,7 +80,7 @@ class Working(NamedTuple):
     counts: jax.Array
 
 
-class Prepared(NamedTuple):
+class PreparedBatch(NamedTuple):
     """Batch in the form that `GradientSteps.gradients` takes.
 
     Attributes:
@@ -116,19 +116,19 @@ class GradientSteps(NamedTuple):
 
     Attributes:
         init: key -> Agent.
-        begin: (Agent, Statistics) -> Working, before the first of several gradient steps.
-        prepare: (Working, Batch) -> Prepared, which is the same at every gradient step after one `begin`.
-        gradients: (Working, Prepared, whether to include the actor) -> (Gradients, metrics, [] float32 by name).
-        apply: (Working, Gradients) -> Working, after one gradient step.
-        end: Working -> Agent.
+        begin: (Agent, Statistics) -> WorkingState, before the first of several gradient steps.
+        prepare: (WorkingState, Batch) -> PreparedBatch, which is the same at every gradient step after one `begin`.
+        gradients: (WorkingState, PreparedBatch, whether to include the actor) -> (Gradients, metrics, [] float32 by name).
+        apply: (WorkingState, Gradients) -> WorkingState, after one gradient step.
+        end: WorkingState -> Agent.
     """
 
     init: Callable[[jax.Array], Agent]
-    begin: Callable[[Agent, Statistics], Working]
-    prepare: Callable[[Working, Batch], Prepared]
-    gradients: Callable[[Working, Prepared, bool], tuple[Gradients, Metrics]]
-    apply: Callable[[Working, Gradients], Working]
-    end: Callable[[Working], Agent]
+    begin: Callable[[Agent, Statistics], WorkingState]
+    prepare: Callable[[WorkingState, Batch], PreparedBatch]
+    gradients: Callable[[WorkingState, PreparedBatch, bool], tuple[Gradients, Metrics]]
+    apply: Callable[[WorkingState, Gradients], WorkingState]
+    end: Callable[[WorkingState], Agent]
 
 
 def _network_parameters(state: Agent) -> tuple[Params, ...]:
@@ -160,12 +160,12 @@ def _start(networks: Networks, auxiliary: Auxiliary, learned_reward: LearnedRewa
 
 
 def _stack_counts(agent: Agent) -> jax.Array:
-    """Stack `Working.counts` in one array: XLA would launch a kernel for each scalar counter."""
+    """Stack `WorkingState.counts` in one array [3]: XLA would launch a kernel for each scalar counter."""
     return jnp.stack([adam.count(agent.critic_optimizer), adam.count(agent.actor_optimizer), agent.updates])
 
 
 def _with_counts(agent: Agent, counts: jax.Array) -> Agent:
-    """Restore the counters in the agent."""
+    """Return the agent with its counters replaced by ``counts``, [3] int32 as in `WorkingState`."""
     return agent.replace(
         critic_optimizer=adam.with_count(agent.critic_optimizer, counts[0]),
         actor_optimizer=adam.with_count(agent.actor_optimizer, counts[1]),
@@ -178,13 +178,16 @@ def _compute_copies(networks: Networks, agent: Agent) -> ComputeCopies:
     return ComputeCopies(*map(networks.compute_copy, _network_parameters(agent)))
 
 
-def _begin(networks: Networks, agent: Agent, statistics: Statistics) -> Working:
+def _begin(networks: Networks, agent: Agent, statistics: Statistics) -> WorkingState:
     """Implement `GradientSteps.begin`."""
-    return Working(agent, _compute_copies(networks, agent), networks.batch_scaling(statistics), _stack_counts(agent))
+    return WorkingState(agent, _compute_copies(networks, agent), networks.batch_scaling(statistics), _stack_counts(agent))
 
 
 def _apply(state: Agent, counts: jax.Array, gradients: Gradients, config: Config) -> Agent:
-    """Step both optimisers, and update the target networks; ``counts`` include this step."""
+    """Step the optimisers (the actor's only if it has a gradient), and update the target networks.
+
+    ``counts`` are `WorkingState.counts` including this step; those in the returned agent are stale.
+    """
     corrections = adam.corrections(counts[:2])
     critic, critic_moments = adam.step(
         state.critic, gradients.critic, state.critic_optimizer, config.ddpg.critic_learning_rate, corrections[0]
@@ -194,14 +197,14 @@ def _apply(state: Agent, counts: jax.Array, gradients: Gradients, config: Config
         actor, actor_moments = adam.step(actor, gradients.actor, actor_moments, config.ddpg.actor_learning_rate, corrections[1])
     follow = jnp.where(counts[2] % config.ddpg.target_update_interval == 0, 1.0 - config.ddpg.target_decay, 0.0)
 
-    def followed(online: Params, target: Params) -> Params:
+    def move_target(online: Params, target: Params) -> Params:
         return optax.incremental_update({part: online[part] for part in target}, target, follow)
 
     return state.replace(
         actor=actor,
         critic=critic,
-        target_actor=followed(actor, state.target_actor),
-        target_critic=followed(critic, state.target_critic),
+        target_actor=move_target(actor, state.target_actor),
+        target_critic=move_target(critic, state.target_critic),
         actor_optimizer=actor_moments,
         critic_optimizer=critic_moments,
         weighting=gradients.weighting,
@@ -249,24 +252,24 @@ def make_ddpg(
     learning = Objectives(networks, config, resolved, auxiliary, shards)
     keeps_state = auxiliary.weighting.name != "none"
 
-    def prepare(working: Working, batch: Batch) -> Prepared:
+    def prepare(working: WorkingState, batch: Batch) -> PreparedBatch:
         image = None
         if auxiliary.needs_image:
             image = networks.normalize(working.scaling.observations, batch.observation_t, batch.shift)
         # Before, goal, after, views: the online networks read the first two, their targets the second and third.
-        return Prepared(batch, networks.prepare_batch(working.scaling, batch), image)
+        return PreparedBatch(batch, networks.prepare_batch(working.scaling, batch), image)
 
-    def gradients(working: Working, prepared: Prepared, with_actor: bool = True) -> tuple[Gradients, Metrics]:
+    def gradients(working: WorkingState, prepared: PreparedBatch, with_actor: bool = True) -> tuple[Gradients, Metrics]:
         agent, (batch, inputs, image, noise) = working.agent, prepared
-        now = ComputeCopies(*map(networks.with_compute_copy, _network_parameters(agent), working.copies))
+        copies = ComputeCopies(*map(networks.with_compute_copy, _network_parameters(agent), working.copies))
         rewarded = None
         if learned_reward is not None:
             rewarded = learned_reward.of_batch(agent.reward_model, working.scaling.observations, inputs, batch)
         if rewarded is not None:
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None
-        state = auxiliary.start(now.critic) if agent.weighting is None else agent.weighting
-        weighted = learning.critic_gradient(now, inputs, image, batch, noise)(now.critic, state)
+        state = auxiliary.start(copies.critic) if agent.weighting is None else agent.weighting
+        weighted = learning.critic_gradient(copies, inputs, image, batch, noise)(copies.critic, state)
         latents, value, keep = weighted.extra
         counts = diagnostics.count_rewards(
             batch.reward, keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
@@ -274,8 +277,8 @@ def make_ddpg(
         metrics = _loss_metrics(weighted, value)
         actor_gradient, mean_square = None, None
         if with_actor:
-            (policy_loss, action), actor_gradient = jax.value_and_grad(learning.of_actor, has_aux=True)(
-                now.actor, now.critic, inputs, latents, image, batch, weighted.weights
+            (policy_loss, action), actor_gradient = jax.value_and_grad(learning.actor_loss, has_aux=True)(
+                copies.actor, copies.critic, inputs, latents, image, batch, weighted.weights
             )
             actor_gradient = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), actor_gradient)
             metrics["train/actor_loss"], mean_square = policy_loss, jnp.mean(jnp.square(action))
@@ -293,7 +296,7 @@ def make_ddpg(
         critic_gradient = weighted.gradient if own_gradient is None else own_gradient
         return Gradients(critic_gradient, actor_gradient, weighted.state if keeps_state else None, of_model), metrics
 
-    def apply(working: Working, chosen: Gradients) -> Working:
+    def apply(working: WorkingState, chosen: Gradients) -> WorkingState:
         counts = working.counts + jnp.array([1, int(chosen.actor is not None), 1])
         agent = _apply(working.agent, counts, chosen, config)
         if learned_reward is not None:
@@ -311,7 +314,7 @@ def make_ddpg(
 
 
 DrawNoise = Callable[[jax.Array, int], jax.Array]
-"""(key, U) -> `Prepared.noise` of U gradient steps, [U, B, A]."""
+"""(key, U) -> `PreparedBatch.noise` of U gradient steps, [U, B, A]."""
 
 
 def make_update(
@@ -323,7 +326,9 @@ def make_update(
     def update(agent: Agent, statistics: Statistics, batches: Batches, key: jax.Array) -> tuple[Agent, Metrics]:
         names: list[str] = []
 
-        def take(state: tuple[Working, Prepared], following: Any) -> tuple[tuple[Working, Prepared], jax.Array]:
+        def take(
+            state: tuple[WorkingState, PreparedBatch], following: Any
+        ) -> tuple[tuple[WorkingState, PreparedBatch], jax.Array]:
             """Take gradient steps, of which only the last updates the actor; unrolled, so that the body has no conditional.
 
             Each step receives its prepared batch, and prepares the next one, which a GPU can do while it computes; otherwise,
@@ -340,7 +345,7 @@ def make_update(
             metrics = jnp.stack([_mean([row[name] for row in rows if name in row]) for name in names])
             return (working, prepared), metrics
 
-        def read(working: Working, row: tuple[Any, jax.Array | None]) -> Prepared:
+        def read(working: WorkingState, row: tuple[Any, jax.Array | None]) -> PreparedBatch:
             choice, noise = row
             return steps.prepare(working, batches.read(choice))._replace(noise=noise)
 
@@ -371,7 +376,7 @@ def build(setup: Setup, critic_heads: int = 1, draw_noise: DrawNoise | None = No
 
     Args:
         setup: Configuration and sizes.
-        critic_heads: Number of critic heads, which share one target, the minimum of theirs (`Networks.critic_heads`).
+        critic_heads: Number of critic heads; all share one target, from the minimum of their values (`Networks.critic_heads`).
         draw_noise: Sampler of the noise on actions in targets; None for no noise.
     """
     config, resolved = setup.config, setup.resolved

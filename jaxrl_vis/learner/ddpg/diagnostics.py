@@ -1,7 +1,7 @@
 """Diagnostics of a batch's rewards against the ground truth, which is known only in simulation.
 
 The ratio of two fractions, each averaged over many batches, estimates the fraction over all of these batches: precision of the
-filter = ``filtered_false_share`` / ``filtered_share`` (see `run.metrics`).
+filter = ``filtered_false_share`` / ``filtered_share``.
 """
 
 import jax
@@ -18,7 +18,9 @@ def count_rewards(
     success: jax.Array | None = None,
     graded: bool = False,
 ) -> Metrics:
-    """Count positives, negatives and errors among B transitions, [] float32 by name; `fractions` converts them to fractions.
+    """Count negatives, filtered transitions and errors among B transitions, [] float32 by name, for `fractions`.
+
+    ``positive_share`` is a fraction already.
 
     If a batch is divided among devices, average the counts over the devices before calling `fractions`.
 
@@ -45,16 +47,16 @@ def count_rewards(
     }
 
 
-def fractions(counts: Metrics, parts: int = 1) -> Metrics:
+def fractions(counts: Metrics, num_shards: int = 1) -> Metrics:
     """Compute fractions of a batch, [] float32 by name; docs/learner.md defines them.
 
     Args:
-        counts: Counts from `count_rewards`; for a batch in several parts, their mean over the parts.
-        parts: Number of parts.
+        counts: Counts from `count_rewards`; for a batch divided into shards, their mean over the shards.
+        num_shards: Number of shards.
     """
 
-    def fraction(part: str, total: str) -> jax.Array:
-        return counts[part] / jnp.maximum(counts[total], 1.0 / parts)
+    def fraction(count: str, total: str) -> jax.Array:
+        return counts[count] / jnp.maximum(counts[total], 1.0 / num_shards)
 
     result = {"positive_share": counts["positive_share"], "filtered_share": fraction("filtered", "negative")}
     if "failure" not in counts:

@@ -2,8 +2,9 @@
 
     autoencoder   cosine of the latents of achieved observation and goal (thesis, section 5.1.5, Auto Encoder); trained to
                   reconstruct achieved observations
-    classifier    probability that the achieved observation is the goal (after VICE: Fu et al., 2018, arXiv 1805.11686);
-                  trained to discriminate goals paired with themselves from achieved observations paired with their goals
+    classifier    probability that the achieved observation is the goal, doubled and at most 1 (after VICE: Fu et al., 2018,
+                  arXiv 1805.11686); trained to discriminate goals paired with themselves from achieved observations paired
+                  with their goals
 
 Rewards lie between R- and R+, and are recomputed for every batch with the current model, without gradient.
 """
@@ -40,7 +41,7 @@ class ModelState(Replaceable):
     optimizer: Any
 
 
-class Rewarded(NamedTuple):
+class BatchRewards(NamedTuple):
     """Result of `LearnedReward.of_batch`.
 
     Attributes:
@@ -54,7 +55,7 @@ class Rewarded(NamedTuple):
     gradient: Params
 
 
-class Compared(NamedTuple):
+class RewardInputs(NamedTuple):
     """Observations that a model compares, in the form that encoders read.
 
     Attributes:
@@ -77,22 +78,22 @@ class LearnedReward:
         name: Name of the method, used for the metric of its loss.
         networks: Architecture of the encoder.
         init_params: key -> parameters.
-        loss_and_reward: (parameters, `Compared`) -> loss [] and rewards [B] float32.
+        loss_and_reward: (parameters, `RewardInputs`) -> loss [] and rewards [B] float32.
         optimizer: Optimiser of the parameters.
     """
 
     name: str
     networks: Networks
     init_params: Callable[[jax.Array], Params]
-    loss_and_reward: Callable[[Params, Compared], tuple[jax.Array, jax.Array]]
+    loss_and_reward: Callable[[Params, RewardInputs], tuple[jax.Array, jax.Array]]
     optimizer: optax.GradientTransformation
 
     def init(self, key: jax.Array) -> ModelState:
-        """Initialise the model."""
+        """Initialise the parameters and the optimiser's state from a typed key []."""
         params = self.init_params(key)
         return ModelState(params=params, optimizer=self.optimizer.init(params))
 
-    def of_batch(self, state: ModelState, scaling: Scaling, inputs: Inputs, batch: Batch) -> Rewarded:
+    def of_batch(self, state: ModelState, scaling: Scaling, inputs: Inputs, batch: Batch) -> BatchRewards:
         """Compute the rewards of a batch, and the model's gradient.
 
         Args:
@@ -106,18 +107,18 @@ class LearnedReward:
         else:
             reached = batch.reached
             pieces = [(self.networks.prepare(scaling, reached), slice(None))]
-        compared = Compared(pieces, inputs.pieces("goal"), self.networks.normalize(scaling, reached), batch)
+        compared = RewardInputs(pieces, inputs.pieces("goal"), self.networks.normalize(scaling, reached), batch)
         (loss, reward), gradient = jax.value_and_grad(self.loss_and_reward, has_aux=True)(state.params, compared)
-        return Rewarded(jax.lax.stop_gradient(reward), loss, gradient)
+        return BatchRewards(jax.lax.stop_gradient(reward), loss, gradient)
 
     def apply(self, state: ModelState, gradient: Params) -> ModelState:
-        """Take one step of the optimiser."""
+        """Take one step of the optimiser; return the new state."""
         change, moments = self.optimizer.update(gradient, state.optimizer)
         return ModelState(params=optax.apply_updates(state.params, change), optimizer=moments)
 
 
 def make_autoencoder(networks: Networks, config: Config, resolved: Resolved) -> LearnedReward:
-    """Build the autoencoder in whose latent space observations are compared."""
+    """Build the reward model that compares observations in the latent space of an autoencoder."""
     shape = networks.observation_spec, networks.action_size, config.network.latent_size
     spec = auxtasks.Spec(*shape, levels=len(config.network.encoder_filters), dtype=networks.dtype)
     task = auxtasks.make(("autoencoder",), spec)["autoencoder"]
@@ -126,7 +127,7 @@ def make_autoencoder(networks: Networks, config: Config, resolved: Resolved) -> 
         encoder_key, decoder_key = jax.random.split(key)
         return {"encoder": networks.init_encoder(encoder_key), "decoder": task.init(decoder_key)}
 
-    def loss_and_reward(params: Params, compared: Compared) -> tuple[jax.Array, jax.Array]:
+    def loss_and_reward(params: Params, compared: RewardInputs) -> tuple[jax.Array, jax.Array]:
         latent = networks.encode_pieces(params, compared.reached)
         view = auxtasks.View(latent_t=latent, action=compared.batch.action, image=compared.image)
         goal_latent = networks.encode_pieces(jax.lax.stop_gradient(params), compared.goal)
@@ -137,7 +138,7 @@ def make_autoencoder(networks: Networks, config: Config, resolved: Resolved) -> 
 
 
 def make_classifier(networks: Networks, config: Config, resolved: Resolved) -> LearnedReward:
-    """Build the classifier of pairs of achieved observation and goal.
+    """Build the reward model that classifies pairs of achieved observation and goal.
 
     All achieved observations are negatives, as in VICE, even if they equal the goal: both classes are then equally likely.
     """
@@ -148,7 +149,7 @@ def make_classifier(networks: Networks, config: Config, resolved: Resolved) -> L
         inputs = jnp.zeros((1, 2 * config.network.latent_size))
         return {"encoder": networks.init_encoder(encoder_key), "head": head.init(head_key, inputs)["params"]}
 
-    def loss_and_reward(params: Params, compared: Compared) -> tuple[jax.Array, jax.Array]:
+    def loss_and_reward(params: Params, compared: RewardInputs) -> tuple[jax.Array, jax.Array]:
         reached, goal = (networks.encode_pieces(params, pieces) for pieces in (compared.reached, compared.goal))
         pairs = jnp.stack([jnp.concatenate([goal, reached]), jnp.concatenate([goal, goal])])
         of_goals, of_reached = head.apply({"params": params["head"]}, pairs)[:, 0].reshape(2, -1)

@@ -32,7 +32,7 @@ from jaxrl_vis.weighting import MAIN, Weighted, WeightingState, weighted_grad
 
 
 class ComputeCopies(NamedTuple):
-    """Parameters of an agent's four networks in the compute dtype (`Networks.compute_copy`)."""
+    """Compute copies of an agent's four networks (`Networks.compute_copy`), or their parameters with these substituted."""
 
     actor: Params
     critic: Params
@@ -61,14 +61,14 @@ class Latents(NamedTuple):
     views: dict[str, jax.Array]
 
 
-def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: Inputs, apart: bool) -> Latents:
+def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: Inputs, separately: bool) -> Latents:
     """Encode all observations that losses read, with gradient.
 
-    Most auxiliary losses read only one or two of them. If encoded ``apart``, the gradient of each loss passes through these
-    alone.
+    Most auxiliary losses read only one or two of them. If encoded ``separately``, the gradient of each loss passes through
+    these alone.
     """
     names = ("before", "goal", *auxiliary.encoded)
-    if apart:
+    if separately:
         latents = [_encode(networks, params, inputs, name)[0] for name in names]
         pair = jnp.stack(latents[:2])
     else:
@@ -107,7 +107,7 @@ def _collect_latents(auxiliary: Auxiliary, encoded: Latents | dict[str, jax.Arra
 
 
 def _next_latents(networks: Networks, copies: ComputeCopies, inputs: Inputs, latents: Latents) -> tuple[jax.Array, jax.Array]:
-    """Encode the next observation and the goal for the target actor and the target critic: [2, B, latent] each.
+    """Encode next observations and goals for the target actor, and for the target critic; return [2, B, latent] of each.
 
     Heads take them in this order; inputs are stored as (goal, after). ``latents`` are the online critic's.
     """
@@ -130,7 +130,15 @@ def _minimum(values: jax.Array) -> jax.Array:
 
 @dataclasses.dataclass(frozen=True)
 class Objectives:
-    """Losses of both networks and their weighted gradients, for one configuration."""
+    """Losses of both networks and their weighted gradients, for one configuration.
+
+    Attributes:
+        networks: Architecture of the networks.
+        config: Configuration of the run.
+        resolved: Rewards, discount, filter threshold and bounds of the targets.
+        auxiliary: Auxiliary tasks and their weighting.
+        shards: Shards of the learner; batches are those of one shard.
+    """
 
     networks: Networks
     config: Config
@@ -158,7 +166,7 @@ class Objectives:
         networks, weighting, mode = self.networks, self.auxiliary.weighting, self.auxiliary.gradient_mode
 
         def encode(encoder: Params) -> Latents:
-            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, apart=mode == "per_loss")
+            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, separately=mode == "per_loss")
 
         def critic_losses(critic: Params, encoded: Latents | dict[str, jax.Array]):
             assert batch.reward is not None
@@ -180,7 +188,7 @@ class Objectives:
         return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), mode, **options)
 
     def _kept_mean(self, keep: jax.Array) -> jax.Array | None:
-        """Return the mean number of unfiltered transitions per shard, the divisor for all shards; None for each its own."""
+        """Return the mean number of unfiltered transitions per shard, the divisor for all; None if each divides by its own."""
         if self.shards.count == 1 or math.isinf(self.resolved.filter_threshold):
             return None
         return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
@@ -199,7 +207,7 @@ class Objectives:
         discount = resolved.discount if batch.discount is None else batch.discount
         return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
 
-    def of_actor(
+    def actor_loss(
         self,
         actor: Params,
         critic: Params,
@@ -209,11 +217,14 @@ class Objectives:
         batch: Batch,
         weights: dict[str, jax.Array],
     ) -> tuple[jax.Array, jax.Array]:
-        """Compute the actor's loss, including its auxiliary losses with the critic's weights, and its actions [B, A]."""
+        """Compute the actor's loss [] and its actions [B, A].
+
+        An actor with an encoder of its own also has auxiliary losses, with the critic's ``weights``, [] float32 by name.
+        """
         has_encoder = self.config.network.encoders == "separate"
         latents, others = critic_latents, {}
         if has_encoder:
-            latents = _encode_online(self.networks, self.auxiliary, actor, inputs, apart=False)
+            latents = _encode_online(self.networks, self.auxiliary, actor, inputs, separately=False)
             others = self._auxiliary(actor, latents, inputs, image, batch, weights)
         if self.auxiliary.weighting.log:
             others = {name: self.shards.global_mean(loss) for name, loss in others.items()}
@@ -238,7 +249,7 @@ class Objectives:
         batch: Batch,
         weights: dict[str, jax.Array] | None = None,
     ) -> dict[str, jax.Array]:
-        """Compute the auxiliary losses of a network's latents, by name.
+        """Compute the auxiliary losses of a network's latents, [] float32 by name.
 
         ``weights`` are applied here only if they are for the encoder alone; the sum of the losses applies those of the heads.
         """

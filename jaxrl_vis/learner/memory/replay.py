@@ -39,7 +39,7 @@ def pack(observations: jax.Array) -> jax.Array:
 
 
 def unpack(observations: jax.Array) -> jax.Array:
-    """Invert `pack`."""
+    """Invert `pack`: [..., W/4] uint32 -> [..., W] uint8, other dtypes unchanged."""
     if observations.dtype != jnp.uint32:
         return observations
     *shape, words = observations.shape
@@ -47,7 +47,7 @@ def unpack(observations: jax.Array) -> jax.Array:
 
 
 def _pack_steps(array: jax.Array) -> jax.Array:
-    """Apply `pack` to each step of an array [episodes, steps, ...]."""
+    """Apply `pack` to each step of an array [episodes, steps, ...]; one number per step stays unchanged."""
     return pack(array) if array.ndim > 2 else array
 
 
@@ -123,18 +123,18 @@ class Replay(NamedTuple):
         """Return shapes and dtypes of the storage, without allocating it; arguments as for `init`."""
         return jax.eval_shape(lambda: self.init(*args))
 
-    def _stored(self, rollout: Episodes) -> Episodes:
-        """Convert episodes to their stored form."""
+    def _to_storage(self, rollout: Episodes) -> Episodes:
+        """Convert a rollout's episodes to their stored form: only the newest image of each observation, packed."""
         newest = rollout.observations[:, :, : rollout.observations.shape[2] // self.frame_stack]
         stored = {name: _pack_steps(array) for name, array in rollout.stored.items()}
         return rollout.replace(observations=pack(newest), stored=stored)
 
     def of_rollout(self, rollout: Episodes) -> ReplayState:
         """Create a replay that holds just the E episodes of one rollout."""
-        return ReplayState(episodes=self._stored(rollout), size=jnp.full((), self.num_envs, jnp.int32))
+        return ReplayState(episodes=self._to_storage(rollout), size=jnp.full((), self.num_envs, jnp.int32))
 
     def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
-        """Write the E episodes of a rollout; once the ring is full, they overwrite the oldest ones.
+        """Write the E episodes of a rollout, over the oldest ones once the ring is full; return the new state.
 
         Args:
             state: State of the replay before the insertion.
@@ -145,16 +145,16 @@ class Replay(NamedTuple):
         episodes = jax.tree.map(
             lambda storage, new: jax.lax.dynamic_update_slice_in_dim(storage, new, start, axis=0),
             state.episodes,
-            self._stored(rollout),
+            self._to_storage(rollout),
         )
         return ReplayState(episodes=episodes, size=jnp.minimum(state.size + self.num_envs, self.num_episodes))
 
     def _latest(self, iteration: jax.Array) -> jax.Array:
-        """Return the position of the last episode of the rollout of ``iteration``."""
+        """Return the position, [] int32, of the last episode of the rollout of ``iteration``."""
         return (iteration % self.num_rollouts + 1) * self.num_envs - 1
 
     def is_stored(self, state: ReplayState, iteration: jax.Array) -> jax.Array:
-        """Return the mask [N] of occupied positions. A resumed run may begin anywhere in the ring.
+        """Return the mask [N] bool of occupied positions. A resumed run may begin anywhere in the ring.
 
         Args:
             state: The replay, with the rollout of ``iteration`` inserted.
@@ -168,7 +168,7 @@ class Replay(NamedTuple):
 
         Args:
             state: The replay, with the rollout of ``iteration`` inserted.
-            key: [] a typed key.
+            key: [] typed key.
             iteration: [] int32.
             batch_size: B.
         """
@@ -193,13 +193,14 @@ class Replay(NamedTuple):
 
         Args:
             state: The replay.
-            indices: Places of the transitions, [B] each.
+            indices: Positions of the transitions, [B] each.
             goal_slot: [B] int32 in [1, T+1].
             steps: Number of steps from the first to the last observation of a transition; fewer at the end of an episode.
             goal_episode: [B] int32, episodes of the goal slots; None for the transitions' own episodes.
 
         Returns:
-            Transitions without rewards. Stacked images of goals are at rest: copies of the newest one.
+            Transitions without rewards; ``state_tp1`` is the state after one step, even if ``steps`` is greater. Stacked images
+            of goals are static: copies of the newest one.
         """
         observations, states, actions = state.episodes.observations, state.episodes.states, state.episodes.actions
         episode, time = indices
@@ -215,11 +216,11 @@ class Replay(NamedTuple):
             full_states=None if full_states is None else full_states[episodes[::2], slots[::2]],
         )
 
-    def _read(self, stored: jax.Array, episodes: jax.Array, slots: jax.Array, stands_still: jax.Array) -> jax.Array:
+    def _read(self, stored: jax.Array, episodes: jax.Array, slots: jax.Array, is_static: jax.Array) -> jax.Array:
         """Read observations [..., C, H, W] from slots [...] of episodes [...]; at rest, all stacked images are the newest."""
         if self.frame_stack == 1:
             return unpack(stored[episodes, slots])
-        ago = jnp.where(stands_still[..., None], 0, jnp.arange(self.frame_stack))
+        ago = jnp.where(is_static[..., None], 0, jnp.arange(self.frame_stack))
         images = unpack(stored[episodes[..., None], jnp.maximum(slots[..., None] - ago, 0)])
         return images.reshape(*slots.shape, -1, *images.shape[-2:])
 
@@ -229,7 +230,7 @@ class Replay(NamedTuple):
         episodes, slots = jnp.indices(stored.shape[:2])
         return self._read(stored, episodes, slots, slots > self.horizon)
 
-    def stored(self, state: ReplayState, indices: Indices) -> dict[str, jax.Array]:
+    def read_stored(self, state: ReplayState, indices: Indices) -> dict[str, jax.Array]:
         """Read the arrays that auxiliary tasks stored for transitions, by task: [B, ...]."""
         return {name: unpack(array[indices.episode, indices.time]) for name, array in state.episodes.stored.items()}
 

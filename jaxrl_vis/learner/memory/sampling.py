@@ -39,7 +39,7 @@ class Choice(NamedTuple):
         goal_slot: [B] int32 in [t + 1, T + 1]; for goals from another episode, in [1, T].
         goal_episode: [B] int32, episodes of the goal slots; None for the transitions' own episodes.
         shift: [B, 2] int32, see `Batch`; or None.
-        target_key: [] a typed key, for targets of auxiliary tasks; or None.
+        target_key: [] typed key, for targets of auxiliary tasks; or None.
         clutter_end: [] float32, see `reward_errors`; or None.
         is_replaceable: [B] bool, mask of relabelled goals to be replaced by another transition's if they are already reached;
             None if none is, or if true states have decided that (``goal_episode``).
@@ -121,7 +121,10 @@ class Sampler:
         return choose_goal_slots(key, time, self.replay.horizon, *probabilities, discount)
 
     def _replace_trivial_goals(self, state: ReplayState, choice: Choice, key: jax.Array) -> Choice:
-        """Replace most of the relabelled goals that are already reached by goals from another episode.
+        """Substitute goals of another episode for the relabelled goals that the transition has reached before its action.
+
+        A fraction ``trivial_goals`` of these goals is kept. Rewards that compare observations cannot tell yet which goals are
+        reached: then only ``is_replaceable`` is set, for `_replace_reached_goals`.
 
         They are not replaced by original goals. If these look different from observations in episodes (VisualFingerTurn's
         finger always hangs down in them), rarely reached goals would all share that look, and the critic could infer rewards
@@ -138,7 +141,7 @@ class Sampler:
         return choice._replace(goal_episode=jnp.where(is_replaceable, jnp.roll(episode, 1), episode))
 
     def _replace_reached_goals(self, batch: Batch, is_replaceable: jax.Array) -> Batch:
-        """Replace those goals in ``is_replaceable`` [B] that are reached before the action by the next transition's."""
+        """Substitute the next transition's goal for those in ``is_replaceable`` [B] that are reached before the action."""
         before = batch.observation_t if self.as_goal is None else jax.vmap(self.as_goal)(batch.observation_t)
         is_replaceable = is_replaceable & (self._reward(batch, before, 1.0, 0.0) > 0.0)
 
@@ -163,7 +166,7 @@ class Sampler:
         batch = batch.replace(shift=choice.shift)
         if choice.target_key is not None:
             assert self.auxiliary is not None
-            batch = self.auxiliary.with_targets(choice.target_key, batch, self.replay.stored(state, choice.indices))
+            batch = self.auxiliary.with_targets(choice.target_key, batch, self.replay.read_stored(state, choice.indices))
         reached = batch.observation_tp1
         if self.as_goal is not None:
             # Stacked images also show motion, while goals are at rest; convert achieved observations to the same form.
@@ -174,13 +177,13 @@ class Sampler:
         if choice.is_replaceable is not None:
             batch = self._replace_reached_goals(batch, choice.is_replaceable)
         if self.config.study.n_step > 1:
-            return self._rewarded_over_steps(state, choice, batch)
+            return self._with_n_step_rewards(state, choice, batch)
         batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
         if self.resolved.method.is_learned:
             return batch  # the learner computes rewards with its current model (`learned_reward`)
         return batch.replace(reward=self.reward(batch, reached, choice.clutter_end))
 
-    def _rewarded_over_steps(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
+    def _with_n_step_rewards(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
         """Replace rewards by discounted sums of the oracle's over up to ``n_step`` steps, and adapt the discounts."""
         episode, time = choice.indices
         after = time[:, None] + 1 + jnp.arange(self.config.study.n_step)  # slots that the steps lead to, [B, n]
@@ -213,7 +216,7 @@ class Sampler:
         return make_reward(self.config, self.resolved.method, self.mask)
 
     def _estimated_reward(self, batch: Batch, clutter_end: jax.Array | None) -> jax.Array:
-        """Compute the oracle's rewards, with an estimator's errors if the configuration has any."""
+        """Compute the oracle's rewards [B] float32, with an estimator's errors if the configuration has any."""
         config, positive, negative = self.config, self.resolved.reward_positive, self.resolved.reward_negative
         states = (
             reward_errors.estimate(batch.state_tp1, config.study.reward_noise) if config.study.reward_noise else batch.state_tp1

@@ -38,14 +38,14 @@ def from_blocks(blocks: jax.Array, height: int, width: int) -> jax.Array:
     return blocks.reshape(*batch, channels, height, width)
 
 
-def shifted(images: jax.Array, shift: jax.Array) -> jax.Array:
+def shift_images(images: jax.Array, shift: jax.Array) -> jax.Array:
     """Shift planar images [B, C, H, W] by [B, 2] int32 pixels, down and to the right; fill with 0."""
     height, width = images.shape[-2:]
 
-    def moved(image: jax.Array, shift: jax.Array) -> jax.Array:
+    def shift_image(image: jax.Array, shift: jax.Array) -> jax.Array:
         rows, columns = jnp.arange(height) - shift[0], jnp.arange(width) - shift[1]
         inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
         rows, columns = jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1)
         return jnp.where(inside, image[..., rows, :][..., columns], 0)
 
-    return jax.vmap(moved)(images, shift)
+    return jax.vmap(shift_image)(images, shift)

@@ -1,6 +1,6 @@
 """Forward-mode differentiation through operations with custom reverse-mode rules.
 
-`jax.custom_vjp` defines reverse-mode differentiation only. While traced, such functions call `are_wanted`; inside
+`jax.custom_vjp` defines reverse-mode differentiation only. While traced, such functions call `is_active`: inside
 `with_tangents` they use plain JAX, which supports both modes.
 """
 
@@ -20,6 +20,6 @@ def with_tangents() -> Iterator[None]:
         yield
 
 
-def are_wanted() -> bool:
-    """Return True if the current trace needs tangents."""
+def is_active() -> bool:
+    """Return True inside `with_tangents`, where the current trace must support forward mode."""
     return bool(_wanted.value)

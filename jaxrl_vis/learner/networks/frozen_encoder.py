@@ -1,7 +1,7 @@
 """Files of frozen image encoders: parameters of `modules.Encoder`, and the normalisation of the images.
 
 shape     [3] int64: C, H, W of the images
-mean      [C, H, W] float32; likewise ``scale``, 1 / standard deviation
+mean      [C, H, W] float32; the same shape and dtype: ``scale``, 1 / standard deviation
 kernel_0, bias_0, ..., latent/kernel, latent/bias     float32
 """
 
@@ -23,7 +23,10 @@ _LIMIT = 5.0  # clipping bound of normalised values, the default of ``normalizer
 
 
 def save(path: Path | str, encoder: Params, scaling: Scaling) -> None:
-    """Write an encoder to a file: parameters of `modules.Encoder`, and the scaling of its images [C, H, W]."""
+    """Write an encoder to a file: parameters of `modules.Encoder`, and the scaling of its images [C, H, W].
+
+    ``.npz`` is appended to the name unless it ends so (`numpy.savez`).
+    """
     arrays = {name: leaf for name, leaf in encoder.items() if name != "latent"}
     arrays |= {f"latent/{name}": leaf for name, leaf in encoder["latent"].items()}
     np.savez(path, shape=np.array(scaling.mean.shape), mean=scaling.mean, scale=scaling.scale, **jax.device_get(arrays))

@@ -7,7 +7,7 @@ from jaxrl_vis.learner.networks import forward_mode
 
 def product(values: jax.Array, kernel: jax.Array) -> jax.Array:
     """Compute ``values @ kernel`` for [..., M, K] and [..., K, N]."""
-    return values @ kernel if forward_mode.are_wanted() else _product_with_gradient(values, kernel)
+    return values @ kernel if forward_mode.is_active() else _product_with_gradient(values, kernel)
 
 
 @jax.custom_vjp

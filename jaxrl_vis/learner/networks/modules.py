@@ -31,7 +31,13 @@ _NARROW = 16
 
 
 class Encoder(nn.Module):
-    """Encoder: [B, blocks, 4^levels * C] -> [B, latent]; results of several arrays are concatenated."""
+    """Encoder of images in nested blocks: [B, blocks, 4^levels * C] -> [B, latent] of ``dtype``.
+
+    Attributes:
+        filters: Output channels of each convolution; their number is ``levels``.
+        latent_size: Size of the latent, the output of the last, dense layer.
+        dtype: Dtype of the computation.
+    """
 
     filters: Sequence[int]
     latent_size: int
@@ -39,7 +45,12 @@ class Encoder(nn.Module):
 
     @nn.compact
     def __call__(self, *pieces: jax.Array, first_layer: int = 0) -> jax.Array:
-        """Apply the layers from ``first_layer`` on."""
+        """Apply the layers from ``first_layer`` on; concatenate the latents of all ``pieces``.
+
+        Args:
+            pieces: Arrays [B, blocks, 4^(levels - first_layer) * channels], the input of that layer.
+            first_layer: Index of the first convolution to apply; results of earlier ones are in ``pieces``.
+        """
         pieces = tuple(blocks.astype(self.dtype) for blocks in pieces)
         count, size = pieces[0].shape[1:]
         channels = size // 4 ** (len(self.filters) - first_layer)
@@ -64,6 +75,11 @@ class Dense(nn.Module):
     """Dense layer [B, inputs] -> [B, size], as `flax.linen.Dense`.
 
     Inputs may be passed as parts, arrays [B, part] or [parts, B, part], which are not concatenated in memory.
+
+    Attributes:
+        size: Number of outputs.
+        dtype: Dtype of the computation and the output.
+        bias_init, kernel_init: Initialisers; by default zeros and Glorot's uniform distribution.
     """
 
     size: int
@@ -73,27 +89,33 @@ class Dense(nn.Module):
 
     @nn.compact
     def __call__(self, *inputs: jax.Array) -> jax.Array:
-        """Apply the layer."""
+        """Apply the layer to the concatenation of ``inputs`` along the last axis: [B, size]."""
         inputs = tuple(values if values.ndim == 3 else values[None] for values in inputs)
         width = sum(values.shape[0] * values.shape[-1] for values in inputs)
         kernel = self.param("kernel", self.kernel_init, (width, self.size)).astype(self.dtype)
         total, first = self.param("bias", self.bias_init, (self.size,)).astype(self.dtype), 0
         for values in inputs:
-            parts, _, part = values.shape
-            rows = kernel[first : first + parts * part].reshape(parts, part, self.size)
+            blocks, _, block_size = values.shape
+            rows = kernel[first : first + blocks * block_size].reshape(blocks, block_size, self.size)
             values = values.astype(self.dtype)
-            if part <= _NARROW:
+            if block_size <= _NARROW:
                 total = total + jnp.sum(values[..., None] * rows[:, None], axis=(0, 2))
             else:
                 total = total + jnp.sum(product(values, rows), axis=0)
-            first += parts * part
+            first += blocks * block_size
         return total
 
 
 class Head(nn.Module):
-    """Head: inputs as for `Dense` -> [B, outputs] float32.
+    """Multilayer perceptron with ReLUs on latents: inputs as for `Dense` -> [B, outputs] float32.
 
-    ``stabilised``: with layer normalisation, and outputs initially near 0 (Zheng et al., 2024, arXiv 2306.03346).
+    Attributes:
+        hidden_sizes: Sizes of the hidden layers.
+        outputs: Number of outputs.
+        output_bias: Initial bias of the outputs.
+        dtype: Dtype of the hidden layers; the last layer is float32.
+        stabilised: Whether hidden layers are normalised (layer normalisation) and outputs are initially close to
+            ``output_bias`` (Zheng et al., 2024, arXiv 2306.03346).
     """
 
     hidden_sizes: Sequence[int]
@@ -104,7 +126,7 @@ class Head(nn.Module):
 
     @nn.compact
     def __call__(self, *inputs: jax.Array) -> jax.Array:
-        """Apply the layers."""
+        """Apply the layers to the concatenation of ``inputs`` along the last axis: [B, outputs] float32."""
         for layer, size in enumerate(self.hidden_sizes):
             values = Dense(size, self.dtype, name=f"hidden_{layer}")(*inputs)
             if self.stabilised:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.networks import normalizer
-from jaxrl_vis.learner.networks.blocks import shifted, to_blocks
+from jaxrl_vis.learner.networks.blocks import shift_images, to_blocks
 from jaxrl_vis.learner.networks.kernels import encoder as encoder_kernel
 from jaxrl_vis.learner.networks.modules import Encoder, Head
 from jaxrl_vis.learner.networks.normalizer import Scaling
@@ -100,13 +100,10 @@ class Networks:
     """Pure functions of parameters, for one task and one configuration.
 
     Attributes:
-        init_actor, init_critic: key -> {"encoder": ..., "head": ...}.
-        prepare: (scaling, observations [B, ...], optional shift) -> inputs of the encoders, computed once for all four
-            networks.
-        encode: (actor or critic parameters, inputs [B, ...]) -> latent [B, latent].
-        act: (actor, latents [2, B, latent] of observations and goals) -> [B, A] float32 in (-1, 1).
-        values: (critic, latents [2, B, latent], action [B, A], states [B, P] or None) -> values of all heads [K, B] float32.
-        value: The same for the first head only: [B] float32.
+        config: Configuration of the run.
+        observation_spec: Shape and dtype of an observation: [C, H, W] uint8 or [S] float32.
+        action_size: A.
+        critic_output_bias: Initial bias of the critic's output.
         critic_heads: K, number of heads of the critic on one encoder. With several, their parameters have a leading axis [K].
         critic_state_size: P, size of the true states that the critic's heads also read; 0 for none.
     """
@@ -173,7 +170,7 @@ class Networks:
         return Encoder(self.config.network.encoder_filters, self.config.network.latent_size, self.dtype)
 
     def head(self, outputs: int, output_bias: float = 0.0, stabilised: bool = False) -> Any:
-        """Build a head of the configured hidden layers: a flax module, inputs as for `Dense` -> [B, outputs] float32."""
+        """Build a head with the configured hidden layers, a flax module (`modules.Head`); arguments as there."""
         return Head(self.config.network.hidden_sizes, outputs, output_bias, self.dtype, stabilised)
 
     @property
@@ -189,17 +186,17 @@ class Networks:
         return params
 
     def init_encoder(self, key: jax.Array) -> Params:
-        """Initialise an encoder of images, for ``{"encoder": ...}``."""
+        """Initialise the parameters of an encoder of images, for ``{"encoder": ...}``, from a typed key []."""
         blocks = to_blocks(jnp.zeros((1, *self.observation_spec.shape)), self._levels)
         return self._encoder.init(key, blocks)["params"]
 
     def init_actor(self, key: jax.Array) -> Params:
-        """Initialise the actor: without an encoder if it shares the critic's."""
+        """Initialise the actor, {"encoder": ..., "head": ...}: without an encoder for states, or if it shares the critic's."""
         has_encoder = self.config.network.encoders == "separate"
         return self._init(key, self.head(self.action_size, 0.0), 2 * self.latent_size, has_encoder=has_encoder)
 
     def init_critic(self, key: jax.Array) -> Params:
-        """Initialise the critic."""
+        """Initialise the critic, {"encoder": ..., "head": ...}: without an encoder for states; heads are stacked [K, ...]."""
         head = self.head(1, self.critic_output_bias)
         width = 2 * self.latent_size + self.action_size + self.critic_state_size
         critic = self._init(key, head, width)
@@ -215,7 +212,7 @@ class Networks:
         return jax.tree.map(jnp.copy, copied)  # a donated buffer must not appear twice
 
     def with_encoder(self, params: Params, other: Params) -> Params:
-        """Add the encoder of ``other`` to ``params``, unless they have their own or none is needed."""
+        """Return ``params`` with the encoder of ``other``, unless they have their own or ``other`` has none."""
         if "encoder" in params or "encoder" not in other:
             return params
         return {**params, "encoder": other["encoder"]}
@@ -251,7 +248,7 @@ class Networks:
     def prepare_batch(self, scaling: BatchScaling, batch: Batch) -> Inputs:
         """Apply `prepare` to all observations of B transitions."""
         of_observations, of_goals, of_states = scaling
-        states = None if of_states is None else self._normalized(_with_goals(batch), *of_states)
+        states = None if of_states is None else self._normalize(_with_goals(batch), *of_states)
         views = {name: self.prepare(of_observations, images, batch.shift) for name, images in batch.views.items()}
         if of_goals is None:  # together, and while they are bytes
             count, size, *shape = batch.observations.shape
@@ -263,26 +260,28 @@ class Networks:
         return Inputs(jnp.concatenate(pieces), views, states)
 
     def prepare(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
-        """Normalise and reorder observations [B, ...] for the encoders: [B, blocks, block size], or [B, S] for states.
+        """Normalise and reorder observations [B, ...] for the encoders, once for all networks, in the compute dtype.
+
+        The result is [B, blocks, block size], or [B, patches, patch size] for the kernel, or [B, S] for states.
 
         Images are shifted by ``shift`` [B, 2] int32 (see `Batch`) after normalisation, so they are padded with the mean.
         """
         mean, scale = scaling
         if not self.sees_images:
-            return self._normalized(observations, mean, scale)
+            return self._normalize(observations, mean, scale)
         if self.uses_kernel:
             limit = self.config.network.normalizer_clip
             return encoder_kernel.prepare(observations, mean, scale, self._levels, limit, self.dtype, shift)
         if shift is not None:
-            return to_blocks(shifted(self._normalized(observations, mean, scale), shift), self._levels)
-        return self._normalized(*(to_blocks(array, self._levels) for array in (observations, mean, scale)))
+            return to_blocks(shift_images(self._normalize(observations, mean, scale), shift), self._levels)
+        return self._normalize(*(to_blocks(array, self._levels) for array in (observations, mean, scale)))
 
     def normalize(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
         """Normalise like `prepare`, without reordering: [B, ...] in the compute dtype."""
-        normalized = self._normalized(observations, *scaling)
-        return normalized if shift is None else shifted(normalized, shift)
+        normalized = self._normalize(observations, *scaling)
+        return normalized if shift is None else shift_images(normalized, shift)
 
-    def _normalized(self, observations: jax.Array, mean: jax.Array, scale: jax.Array) -> jax.Array:
+    def _normalize(self, observations: jax.Array, mean: jax.Array, scale: jax.Array) -> jax.Array:
         limit = self.config.network.normalizer_clip
         return jnp.clip((observations.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
 
@@ -304,7 +303,7 @@ class Networks:
         return self._encoder.apply({"params": params["encoder"]}, *blocks, first_layer=encoder_kernel.LEVELS)
 
     def act(self, actor: Params, latents: jax.Array) -> jax.Array:
-        """Compute actions [B, A] float32 in (-1, 1) from latents [2, B, latent] of observations and goals."""
+        """Compute actions [B, A] float32 in [-1, 1] from latents [2, B, latent] of observations and goals."""
         return jnp.tanh(self.head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
 
     def values(self, critic: Params, latents: jax.Array, action: jax.Array, states: jax.Array | None = None) -> jax.Array:

@@ -32,7 +32,7 @@ class Policy(NamedTuple):
     Attributes:
         params: (actor parameters with an encoder, Statistics) -> PolicyParams.
         aim: (PolicyParams, goals [E, ...]) -> latents [E, latent], computed once per episode.
-        act: (PolicyParams, observations [E, ...], latents of the goals [E, latent]) -> actions [E, A] float32 in (-1, 1).
+        act: (PolicyParams, observations [E, ...], latents of the goals [E, latent]) -> actions [E, A] float32 in [-1, 1].
     """
 
     params: Callable[[Params, Statistics], PolicyParams]

@@ -6,8 +6,8 @@
 
 Every device runs the whole training iteration on its own part (`jax.shard_map`), so only averages over shards are
 communicated. Random numbers are generated for the whole learner, and each device uses its part of them: environment number 7
-starts and explores alike on any number of devices. Batches differ in one respect from those of a single device: part d of a
-batch is sampled from the episodes of the environments of device d, so each group of environments contributes equally.
+starts and explores identically on any number of devices. Batches differ in one respect from those of a single device: part d of
+a batch is sampled from the episodes of the environments of device d, so each group of environments contributes equally.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from jaxrl_vis.learner.parallel.shards import DATA, ONE, Shards
 from jaxrl_vis.types import LoopState, ReplayState
 
 SEED = "seed"
-"""Name of the other axis of the mesh."""
+"""Name of the mesh axis along which seeds are placed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Layout:
         return Spec() if jax.process_count() > 1 else Spec(SEED)
 
     @property
-    def everywhere(self) -> Spec:
+    def replicated(self) -> Spec:
         """Spec of replicated arrays."""
         return Spec()
 
@@ -99,8 +99,8 @@ class Layout:
         """Convert a tree of partition specs to shardings for `jax.jit` and `jax.device_put`; None on one device."""
         if self.mesh is None:
             return None
-        place = functools.partial(NamedSharding, self.mesh)
-        return jax.tree.map(place, specs, is_leaf=lambda leaf: isinstance(leaf, Spec))
+        make_sharding = functools.partial(NamedSharding, self.mesh)
+        return jax.tree.map(make_sharding, specs, is_leaf=lambda leaf: isinstance(leaf, Spec))
 
     def spread(
         self, function: Callable, in_specs: tuple, out_specs: Any, jit: Callable, kept_as: Any = None, **options: Any
@@ -123,7 +123,7 @@ class Layout:
         return jit(mapped, **shardings, **options)
 
     def with_shardings(self, shapes: Any, specs: Any) -> Any:
-        """Add shardings to shapes (as of `jax.eval_shape`).
+        """Return shapes (as from `jax.eval_shape`) with shardings; unchanged on one device.
 
         Args:
             shapes: A pytree.
@@ -132,27 +132,31 @@ class Layout:
         if self.mesh is None:
             return shapes
 
-        def placed(sharding: NamedSharding, part: Any) -> Any:
-            return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), part)
+        def placed(sharding: NamedSharding, subtree: Any) -> Any:
+            return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), subtree)
 
         return jax.tree.map(placed, self.shardings(specs), shapes)
 
     def put(self, tree: Any, specs: Any) -> Any:
-        """Place arrays by their specs; a leaf of ``specs`` covers a subtree of ``tree``."""
+        """Place arrays by their specs, and return them; a leaf of ``specs`` covers a subtree. Unchanged on one device."""
         if self.mesh is None:
             return tree
 
-        def placed(sharding: NamedSharding, part: Any) -> Any:
-            return jax.tree.map(lambda leaf: put_array(leaf, sharding), part)
+        def placed(sharding: NamedSharding, subtree: Any) -> Any:
+            return jax.tree.map(lambda leaf: put_array(leaf, sharding), subtree)
 
         return jax.tree.map(placed, self.shardings(specs), tree)
 
     def fold_replay(self, replay: ReplayState, num_envs: int) -> ReplayState:
-        """Return one device's part of a learner's replay in its form between two iterations.
+        """Return one device's part of a learner's replay in the form in which it is stored between two iterations.
 
         Args:
             replay: Replay of one learner, [rollouts * E, ...].
             num_envs: E, number of environments in this part.
+
+        Returns:
+            The replay with episodes [rollouts, E, ...] and the size of the whole learner's replay; unchanged if a learner has a
+            single device.
         """
         count = self.shards.count
         if count == 1:
@@ -197,6 +201,8 @@ def _avoid_shardy() -> None:
 def make_layout(config: Config) -> Layout:
     """Place the seeds of a run, and the shards of each learner, on devices.
 
+    For several devices, this may change JAX's global configuration (`_avoid_shardy`).
+
     Args:
         config: Configuration of the run, of which ``devices``, ``data_devices`` and ``seeds`` are used.
 
@@ -205,18 +211,18 @@ def make_layout(config: Config) -> Layout:
     """
     if config.run.devices == 1 and jax.process_count() == 1:
         return ONE_DEVICE
-    there = jax.devices()
-    if config.run.devices > len(there):
-        what = "there is 1" if len(there) == 1 else f"there are {len(there)}"
+    available = jax.devices()
+    if config.run.devices > len(available):
+        what = "there is 1" if len(available) == 1 else f"there are {len(available)}"
         raise RequestError(
-            f"devices {config.run.devices} asks for more than {what} ({there[0].device_kind}): write --devices all"
+            f"devices {config.run.devices} asks for more than {what} ({available[0].device_kind}): write --devices all"
         )
-    if jax.process_count() > 1 and config.run.devices < len(there):
+    if jax.process_count() > 1 and config.run.devices < len(available):
         raise RequestError(
-            f"devices {config.run.devices} would leave some of the {len(there)} devices of {jax.process_count()} processes "
+            f"devices {config.run.devices} would leave some of the {len(available)} devices of {jax.process_count()} processes "
             "without work: write --devices all, or start fewer processes"
         )
     _avoid_shardy()
     along_data = data_devices(config)
-    devices = np.asarray(there[: config.run.devices], dtype=object).reshape(-1, along_data)
+    devices = np.asarray(available[: config.run.devices], dtype=object).reshape(-1, along_data)
     return Layout(Mesh(devices, (SEED, DATA)), Shards(along_data))

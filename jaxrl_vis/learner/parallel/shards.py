@@ -1,7 +1,7 @@
 """Shards of one learner, seen from within one of them: averages over the shards, and each shard's part of an array.
 
-Every function here is called within a mapped axis `DATA` (of `jax.shard_map` or `jax.vmap`), unless there is only one shard:
-then each returns its argument, and adds nothing to the program.
+Every method here is called within a mapped axis `DATA` (of `jax.shard_map` or `jax.vmap`), unless there is only one shard: then
+nothing is communicated, and averages, sums and parts are the arguments themselves.
 """
 
 import dataclasses
@@ -33,15 +33,15 @@ class Shards:
         return restore(jax.lax.pmean(flat, DATA))
 
     def total(self, array: jax.Array) -> jax.Array:
-        """Sum over the shards."""
+        """Sum an array over the shards; the same shape."""
         return array if self.count == 1 else jax.lax.psum(array, DATA)
 
     def global_mean(self, mean: jax.Array) -> jax.Array:
-        """Average over the shards, with the gradient of this shard alone, which is itself to be averaged by `mean`."""
+        """Average a mean [...] over the shards, with the gradient of this shard alone, to be averaged by `mean` itself."""
         return mean if self.count == 1 else mean + jax.lax.stop_gradient(self.mean(mean) - mean)
 
     def part(self, array: jax.Array) -> jax.Array:
-        """Return this shard's part of the whole learner's array, along the first axis."""
+        """Return this shard's part [B / count, ...] of an array [B, ...] of the whole learner."""
         if self.count == 1:
             return array
         size = array.shape[0] // self.count
@@ -61,7 +61,7 @@ class Shards:
         return self.draw(lambda size: jax.random.normal(key, size), shape)
 
     def split(self, key: jax.Array, count: int) -> jax.Array:
-        """Return a key for each of the ``count`` environments of this shard."""
+        """Return a typed key for each of the ``count`` environments of this shard, [count]."""
         return self.part(jax.random.split(key, count * self.count))
 
     def gather(self, array: jax.Array, axis: int = 0) -> jax.Array:
@@ -69,7 +69,7 @@ class Shards:
         return array if self.count == 1 else jax.lax.all_gather(array, DATA, axis=axis, tiled=True)
 
     def own_key(self, key: jax.Array) -> jax.Array:
-        """Derive a key that differs between shards."""
+        """Derive a typed key [] that differs between shards."""
         return key if self.count == 1 else jax.random.fold_in(key, jax.lax.axis_index(DATA))
 
 

@@ -38,7 +38,13 @@ def tree_bytes(shapes: Any) -> int:
 
 
 def available_bytes(device: Any = None) -> int | None:
-    """Return the free memory of a device (by default the first) or, for a CPU, of the host, in bytes; None if unknown."""
+    """Return the free memory of a device or, for a CPU, of the host and its container, in bytes; None if unknown.
+
+    On hosts without ``/proc/meminfo``, all of the host's memory counts as free.
+
+    Args:
+        device: JAX device; None for the first of this process.
+    """
     device = jax.local_devices()[0] if device is None else device
     if device.platform != "cpu":
         statistics = device.memory_stats() or {}
@@ -70,19 +76,21 @@ def _container_bytes() -> int:
         return 2**62
 
 
-def show_bytes(count: float) -> str:
+def format_bytes(count: float) -> str:
     """Format a size as ``1.5 GiB``: always in GiB, so that any two sizes can be compared at a glance."""
     gib = count / 2**30
     return f"{gib:.1f} GiB" if gib >= 0.1 else f"{gib:.3f} GiB" if gib >= 0.001 else "under 0.001 GiB"
 
 
 def _available_bytes(layout: Layout) -> int | None:
-    """Return the minimum free memory of the run's devices, in bytes; None if one is unknown."""
+    """Return the free memory of each of the run's devices, in bytes: the minimum of all, or an equal share of the host's for
+    CPUs; None if unknown.
+    """
     if layout.mesh is None:
         return available_bytes()
     if layout.devices[0].platform == "cpu":  # all of them share the host's memory
-        there = available_bytes()
-        return None if there is None else there // len(layout.devices)
+        host_bytes = available_bytes()
+        return None if host_bytes is None else host_bytes // len(layout.devices)
     available = [available_bytes(device) for device in layout.devices]
     return None if None in available else min(count for count in available if count is not None)
 
@@ -119,12 +127,12 @@ def check_memory(
     bytes_per_rollout = replay * steps_per_iteration / capacity
     collected = bytes_per_rollout * frame_stack
     batch = collected / steps_per_iteration * config.run.batch_size * 4
-    other = train * (1 + _TRAIN_COPIES) + collected * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
+    other_bytes = train * (1 + _TRAIN_COPIES) + collected * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
     available, suffix = _available_bytes(layout), "" if layout.num_devices == 1 else " a device"
     if available is None:
-        return f"replay {show_bytes(replay)}{suffix}"
-    if replay + other > available:
-        fitting = int((available - other) // bytes_per_rollout) * steps_per_iteration
+        return f"replay {format_bytes(replay)}{suffix}"
+    if replay + other_bytes > available:
+        fitting = int((available - other_bytes) // bytes_per_rollout) * steps_per_iteration
         if fitting > 0:
             hint = f"--replay-transitions {fitting} fits"
         else:
@@ -132,10 +140,10 @@ def check_memory(
         seeds = "1 seed" if config.run.seeds == 1 else f"{config.run.seeds} seeds"
         raise RequestError(
             f"a replay of {config.run.replay_transitions} transitions for {seeds} needs "
-            f"{show_bytes(replay)}{suffix}, and networks and rollouts {show_bytes(other)} more; there are "
-            f"{show_bytes(available)}{suffix}: {hint}"
+            f"{format_bytes(replay)}{suffix}, and networks and rollouts {format_bytes(other_bytes)} more; there are "
+            f"{format_bytes(available)}{suffix}: {hint}"
         )
-    return f"replay {show_bytes(replay)} of {show_bytes(available)}{suffix}"
+    return f"replay {format_bytes(replay)} of {format_bytes(available)}{suffix}"
 
 
 def check_compiled(programs: dict[str, Any], is_allocated: bool, layout: Layout = ONE_DEVICE) -> None:
@@ -156,13 +164,15 @@ def check_compiled(programs: dict[str, Any], is_allocated: bool, layout: Layout 
     for name, size in scratch.items():
         if size + (0 if is_allocated else state) > available:
             raise RequestError(
-                f"{name} needs {show_bytes(size)} of scratch memory beside a state of {show_bytes(state)}; there are "
-                f"{show_bytes(available)}: lower --num-envs, --eval-episodes, --batch-size or --replay-transitions"
+                f"{name} needs {format_bytes(size)} of scratch memory beside a state of {format_bytes(state)}; there are "
+                f"{format_bytes(available)}: lower --num-envs, --eval-episodes, --batch-size or --replay-transitions"
             )
 
 
 def fit_together(programs: dict[str, Any], is_allocated: bool, layout: Layout = ONE_DEVICE) -> bool:
     """Return True if all programs fit into memory at once, so that one may be launched while another still runs.
+
+    The result is True, too, if the free memory is unknown.
 
     Args:
         programs, is_allocated, layout: As in `check_compiled`.
@@ -173,7 +183,10 @@ def fit_together(programs: dict[str, Any], is_allocated: bool, layout: Layout = 
 
 
 def _sizes(programs: dict[str, Any]) -> tuple[int, dict[str, int]]:
-    """Return the compiler's figures for one device, in bytes: the trained state, and each program's scratch memory."""
+    """Return the compiler's figures for one device, in bytes: the arguments of ``learn`` (0 without it), scratch by program.
+
+    Scratch memory includes results that do not reuse an argument's memory; that of ``init`` is left out.
+    """
     analyses = {name: program.memory_analysis() for name, program in programs.items()}
     training = analyses.get("learn")
     scratch = {

@@ -14,13 +14,13 @@ from jaxrl_vis.types import LoopState
 _MAX_EPISODES = 64
 
 
-def _checked_part(tree: Any) -> dict[str, Any]:
+def _floating_leaves(tree: Any) -> dict[str, Any]:
     return {name: leaf for name, leaf in named_leaves(tree).items() if jnp.issubdtype(leaf.dtype, jnp.floating)}
 
 
 def nonfinite_leaves(loop: LoopState) -> dict[str, jax.Array]:
     """Return for each floating-point leaf, by name, whether it has a NaN or an infinity, [] bool. Traceable under jit."""
-    return {name: ~jnp.isfinite(leaf).all() for name, leaf in _checked_part(loop).items()}
+    return {name: ~jnp.isfinite(leaf).all() for name, leaf in _floating_leaves(loop).items()}
 
 
 def _episodes(loop: LoopState, *names: str) -> dict[str, np.ndarray]:
@@ -45,11 +45,11 @@ def nonfinite_simulation(loop: LoopState, num_envs: int) -> str | None:
     episodes = _episodes(loop, "actions", *names)
     is_bad = {name: np.asarray(~np.isfinite(array).all(-1)) for name, array in episodes.items()}
     horizon = is_bad["actions"].shape[-1]
-    first_action = _first(is_bad["actions"])
+    first_action = _first_true(is_bad["actions"])
     for name, quantity in (("states", "achieved_state"), ("observations", "observation")):
         if name not in is_bad:
             continue
-        step, goal = _first(is_bad[name][..., : horizon + 1]), is_bad[name][..., horizon + 1]
+        step, goal = _first_true(is_bad[name][..., : horizon + 1]), is_bad[name][..., horizon + 1]
         # Action t leads from state t to state t + 1.
         seeds, slots = np.nonzero(goal | (step <= np.minimum(first_action, horizon)))
         if len(seeds):
@@ -59,8 +59,8 @@ def nonfinite_simulation(loop: LoopState, num_envs: int) -> str | None:
     return None
 
 
-def _first(is_bad: np.ndarray) -> np.ndarray:
-    """Return the index of the first true value along the last axis; the axis' length if there is none."""
+def _first_true(is_bad: np.ndarray) -> np.ndarray:
+    """Return the index [...] of the first true value along the last axis of [..., N]; N if there is none."""
     return np.where(is_bad.any(-1), is_bad.argmax(-1), is_bad.shape[-1])
 
 

@@ -15,20 +15,20 @@ from jaxrl_vis.types import Metrics
 
 
 @jax.jit
-def stacked(metrics: Metrics) -> jax.Array:
-    """Stack metrics, [S] or [] each, in the order of their names: [K, S]."""
+def stack_metrics(metrics: Metrics) -> jax.Array:
+    """Stack K metrics, [S] or [] each, in the order of their names: [K, S], or [K] if all are []."""
     return jnp.stack(jnp.broadcast_arrays(*(metrics[name] for name in sorted(metrics))))
 
 
-class Pending:
+class PendingMetrics:
     """Metrics that a device may still be computing.
 
     Args:
         metrics: [S] or [] float32 each, by name. NumPy arrays are kept as they are.
-        stack: `stacked`, or its compiled program.
+        stack: `stack_metrics`, or its compiled program.
     """
 
-    def __init__(self, metrics: Metrics, stack: Callable[[Metrics], jax.Array] = stacked):
+    def __init__(self, metrics: Metrics, stack: Callable[[Metrics], jax.Array] = stack_metrics):
         self._names = sorted(metrics)
         self._rows: Any = [metrics[name] for name in self._names]
         if any(isinstance(value, jax.Array) for value in self._rows):
@@ -36,7 +36,7 @@ class Pending:
             self._rows.copy_to_host_async()
 
     def read(self) -> dict[str, np.ndarray]:
-        """Wait for the metrics; return them by name, [S] float32 each."""
+        """Wait for the metrics; return them by name, [S] or [] float32 each."""
         return dict(zip(self._names, np.asarray(self._rows), strict=True))
 
     def read_per_seed(self, seeds: int) -> PerSeed:

@@ -26,13 +26,13 @@ from jaxrl_vis.learner.iteration import Learned
 from jaxrl_vis.learner.train_step import JIT_OPTIONS
 from jaxrl_vis.report import videos
 from jaxrl_vis.run.compiled.nonfinite import nonfinite_leaves
-from jaxrl_vis.run.compiled.pending import Pending, stacked
+from jaxrl_vis.run.compiled.pending import PendingMetrics, stack_metrics
 from jaxrl_vis.run.compiled.threaded_rollout import ThreadedRollout
 from jaxrl_vis.run.compiled.trace_cache import TraceCache, fingerprint
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.run.storage.arrays import to_host
 from jaxrl_vis.types import LoopState, Metrics, TrainState
-from jaxrl_vis_envs.compiling.compilation import assume_kernels_compile, failed_kernels, tracing_for_default_device
+from jaxrl_vis_envs.compiling.compilation import any_kernel_failed, assume_kernels_compile, tracing_for_default_device
 
 # Seed of the evaluation key, which is the same at every evaluation and for every seed.
 _EVALUATION_SEED = 2**31 - 1
@@ -60,8 +60,8 @@ class Programs:
     Args:
         config: The run.
         program: From `jaxrl_vis.learner.train_step.make_train_step`, or anything with the same attributes.
-        keep: Cache traced programs on disk, if permitted (see `trace_cache`); ignored on several devices.
-        cache: Cache compiled programs on disk; without, traced ones are not cached either.
+        keep: Whether to cache traced programs on disk, if permitted (see `trace_cache`); ignored on several devices.
+        cache: Whether to cache compiled programs on disk; without, traced ones are not cached either.
 
     Attributes:
         config: The run.
@@ -89,7 +89,7 @@ class Programs:
     @functools.cached_property
     def evaluation_key(self) -> jax.Array:
         """Typed key that determines the episodes of every evaluation, []."""
-        return self.layout.put(jax.random.key(_EVALUATION_SEED), self.layout.everywhere)
+        return self.layout.put(jax.random.key(_EVALUATION_SEED), self.layout.replicated)
 
     @functools.cached_property
     def shapes(self) -> LoopState:
@@ -107,17 +107,17 @@ class Programs:
 
     @property
     def image_seconds(self) -> float:
-        """Duration of a video frame, s: the control period, but at least 0.04 s."""
+        """Duration of a video frame in seconds: the control period, but at least 0.04 s."""
         return max(0.04, float(self.env.control_period))
 
     @property
     def evaluates_ahead(self) -> bool:
         """True if `evaluate` is asynchronous, i.e. returns before the device has finished."""
-        return not self.program.plays_any
+        return not self.program.plays_parts
 
     @property
     def _evaluation(self) -> tuple[str, ...]:
-        return ("play",) if self.program.plays_any else ("evaluate",)
+        return ("play",) if self.program.plays_parts else ("evaluate",)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -155,7 +155,7 @@ class Programs:
                                 lowered = function.lower(*arguments)
                         futures[name] = pool.submit(lowered.compile)
                     self._finish(missing, concurrent_work)
-                    self._keep({name: future.result() for name, future in futures.items()})
+                    self._store({name: future.result() for name, future in futures.items()})
                 if traces is not None:
                     traces.write()
                 break
@@ -163,7 +163,7 @@ class Programs:
                 if traces is not None:  # the fault may lie in the cached programs, or in their kernels: retry without the cache
                     traces.forget()
                     traces, self._may_keep = None, False
-                elif trusting and failed_kernels():
+                elif trusting and any_kernel_failed():
                     trusting = False
                 else:
                     raise
@@ -179,17 +179,17 @@ class Programs:
 
     def _finish(self, names: Sequence[str], concurrent_work: Callable[[], None]) -> None:
         """Do all work that can overlap with XLA's compilation."""
-        if "init" in names and not distributed.are_several():
+        if "init" in names and not distributed.is_multi_process():
             # Extracting the data of keys, as in saving, is also a compiled program.
             to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
         concurrent_work()
 
-    def _keep(self, compiled: dict[str, Any]) -> None:
+    def _store(self, compiled: dict[str, Any]) -> None:
         """Store compiled programs, and compile the stacking of their metrics."""
         for program in compiled.values():
             if metrics := getattr(program.out_info, "metrics", None):
                 shapes = {name: _without_layout(shape) for name, shape in metrics.items()}
-                self._stacks[frozenset(shapes)] = stacked.lower(shapes).compile()
+                self._stacks[frozenset(shapes)] = stack_metrics.lower(shapes).compile()
         self._compiled |= compiled
 
     def _call(self, name: str) -> tuple[Any, tuple]:
@@ -215,23 +215,23 @@ class Programs:
         """Initialise a learner with an empty replay for each of the typed keys [S]."""
         return self.compiled("init")(self.layout.put(keys, self.layout.by_seed))
 
-    def of_evaluation(self) -> dict[str, Any]:
+    def evaluation_programs(self) -> dict[str, Any]:
         """Return the compiled programs that an evaluation needs, by name."""
         return {name: self.compile(self._evaluation)[name] for name in self._evaluation}
 
-    def of_training(self) -> dict[str, Any]:
+    def training_programs(self) -> dict[str, Any]:
         """Return the compiled programs that an iteration needs, by name."""
         compiled = self.compile(_TRAINING)
         return {name: compiled[name] for name in _TRAINING}
 
     def play(self, train: TrainState, keys: jax.Array) -> list[Any]:
-        """Run a training rollout with typed keys [S]; return its parts in order (`rollout_parts.Played`)."""
+        """Run a training rollout with typed keys [S]; return its parts in order (`rollout_parts.PartResult`)."""
         count, exploration = self.config.run.num_envs, self.program.exploration
         return self._rollout.play(self.compiled("play"), train, keys, count, exploration)
 
     def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
         """Run one iteration; ``loop`` is donated. See `Trainer.train_iteration`."""
-        compiled = self.of_training()  # before the first is called, so that they are compiled in parallel
+        compiled = self.training_programs()  # before the first is called, so that they are compiled in parallel
         keys = compiled["keys"](loop.key, loop.iteration)
         learned: Learned = compiled["learn"](loop, self.play(loop.train, keys))
         return learned.loop, learned.metrics
@@ -243,15 +243,15 @@ class Programs:
             train: The learner, [S, ...].
             key: Typed key [] that determines the episodes; None for `evaluation_key`, with the same episodes at every call.
         """
-        chosen: Any = self.evaluation_key if key is None else self.layout.put(key, self.layout.everywhere)
-        if not self.program.plays_any:
+        chosen: Any = self.evaluation_key if key is None else self.layout.put(key, self.layout.replicated)
+        if not self.program.plays_parts:
             return self.compiled("evaluate")(train, chosen)
         keys = jnp.stack([chosen] * len(self.seeds))
         return self._rollout.evaluate(self.compiled("play"), train, keys, self.config.run.eval_episodes, self.env.frame_stack)
 
     def record(self, train: TrainState, key: jax.Array, count: int) -> list[Any]:
         """Roll out episodes without exploration noise, with the program of training rollouts; return their parts
-        (`rollout_parts.Played`).
+        (`rollout_parts.PartResult`).
 
         Args:
             train: The learner, [S, ...].
@@ -259,7 +259,7 @@ class Programs:
             count: Episodes of each learner, rounded up to whole parts.
         """
         program, size = self.compiled("play"), self.program.part_size
-        if self.program.plays_any:
+        if self.program.plays_parts:
             keys = jnp.stack([key] * len(self.seeds))
             return self._rollout.play(program, train, keys, count, NO_EXPLORATION)
         parts = []
@@ -268,9 +268,9 @@ class Programs:
             parts += self._rollout.play(program, train, keys, size, NO_EXPLORATION)
         return parts
 
-    def pending(self, metrics: Metrics) -> Pending:
+    def pending(self, metrics: Metrics) -> PendingMetrics:
         """Prepare metrics of `train_iteration` or `evaluate` for reading by the host, without compiling anything."""
-        return Pending(metrics, self._stacks.get(frozenset(metrics), stacked))
+        return PendingMetrics(metrics, self._stacks.get(frozenset(metrics), stack_metrics))
 
     def nonfinite_leaves(self, loop: LoopState) -> list[str]:
         """List the floating-point leaves of the loop state that hold a NaN or an infinity."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxrl_vis.learner.acting.evaluate import Evaluation, num_recorded, summarize
 from jaxrl_vis.learner.acting.rollout import NO_EXPLORATION, Exploration
-from jaxrl_vis.learner.acting.rollout_parts import Played, join_parts
+from jaxrl_vis.learner.acting.rollout_parts import PartResult, join_parts
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.types import Episodes, Metrics, TrainState
 from jaxrl_vis_envs.cores import num_cores
@@ -31,7 +31,7 @@ class ThreadedRollout:
 
     def play(
         self,
-        program: Callable[..., Played],
+        program: Callable[..., PartResult],
         train: TrainState,
         keys: jax.Array,
         count: int,
@@ -62,7 +62,7 @@ class ThreadedRollout:
         return list(self._pool.map(play, range(0, count, self._size)))
 
     def evaluate(
-        self, program: Callable[..., Played], train: TrainState, keys: jax.Array, count: int, frame_stack: int
+        self, program: Callable[..., PartResult], train: TrainState, keys: jax.Array, count: int, frame_stack: int
     ) -> Evaluation:
         """Evaluate like `TrainStep.evaluate`, with ``program`` and typed keys [S]; return NumPy arrays. See `play`."""
         num_kept = num_recorded(count)

@@ -28,8 +28,8 @@ from jax.extend.core import jaxpr_as_fun
 
 import jaxrl_vis_envs
 from jaxrl_vis.config import HOST, Config, marked
-from jaxrl_vis.host.files import make_private, read_private, replacing, stranger_to
-from jaxrl_vis.host.plugins import own_names
+from jaxrl_vis.host.files import foreign_writer, make_private, read_private, replacing
+from jaxrl_vis.host.plugins import custom_names
 from jaxrl_vis.host.provenance import device_record, versions
 from jaxrl_vis.learner.acting.evaluate import Evaluation
 from jaxrl_vis.learner.acting.rollout import Exploration
@@ -61,7 +61,7 @@ def fingerprint(config: Config, env: GoalEnv, learner: Any = None) -> str | None
         env: Its environment.
         learner: Tree of the learner, or of a policy; only its structure counts.
     """
-    is_ours = type(env).__module__.partition(".")[0] in _PACKAGES and not own_names(config)
+    is_ours = type(env).__module__.partition(".")[0] in _PACKAGES and not custom_names(config)
     if not is_ours or os.environ.get(VARIABLE) == "0":
         return None
     settings = {name: value for name, value in jax.config.values.items() if not any(part in name for part in _WITHOUT_EFFECT)}
@@ -155,15 +155,18 @@ class TraceCache:
         return hashlib.sha256(self._path(name).name.encode() + b"\0" + data).digest()
 
     def _is_private(self) -> bool:
-        """Return True if the folder is private to this user; first revoke the permissions of others if this user owns it."""
+        """Return True if the folder is private to this user; first revoke the permissions of others if this user owns it.
+
+        If not, print the reason to stderr, once per process.
+        """
         try:
             status = self._folder.stat()
-            if stranger_to(status) is not None:
+            if foreign_writer(status) is not None:
                 make_private(self._folder)
                 status = self._folder.stat()
         except OSError:
             return False
-        reason = stranger_to(status)
+        reason = foreign_writer(status)
         if reason is not None:
             _print_once(
                 f"programs kept in {self._folder} are not used: it {reason}; JAX_COMPILATION_CACHE_DIR names another folder"

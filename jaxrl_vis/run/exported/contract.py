@@ -144,7 +144,7 @@ def _channels(pixels: str) -> list[str]:
 
 
 def _plain(config: Any) -> Any:
-    """Return an environment's configuration as a JSON value, without other types; None if it is not a dataclass."""
+    """Return an environment's configuration as a JSON value, without fields of other types; None if it is not a dataclass."""
     if not dataclasses.is_dataclass(config) or isinstance(config, type):
         return None
     simple = (str, int, float, bool, list, tuple, dict, type(None))
@@ -158,13 +158,13 @@ def read_contract(path: Path) -> Contract:
         path: The policy's file, the contract, or the folder of both.
 
     Raises:
-        RequestError: The contract is missing or damaged, or describes another file.
+        RequestError: The contract is missing or damaged, describes another file, or the policy is missing.
     """
     folder = path if path.is_dir() else path.parent
     file, hint = folder / FILE, "export again with --overwrite"
     if not file.exists():
-        what = path if path.exists() else f"{path} does not exist, and"
-        raise RequestError(f"{what} has no {FILE} beside it: name a file that `jaxrl-vis export` wrote")
+        subject = path if path.exists() else f"{path} does not exist, and"
+        raise RequestError(f"{subject} has no {FILE} beside it: name a file that `jaxrl-vis export` wrote")
     values = read_json(file, hint=hint)
     try:
         if values["schema"] != SCHEMA:
@@ -184,15 +184,15 @@ def read_contract(path: Path) -> Contract:
     return Contract(values["format"], folder / name, folder / GOLDEN, forms, values)
 
 
-def _form(part: dict[str, Any]) -> Form:
+def _form(entry: dict[str, Any]) -> Form:
     """Read the form of an input or output.
 
     Raises:
-        ValueError, TypeError, KeyError: ``part`` is invalid.
+        ValueError, TypeError, KeyError: ``entry`` is invalid.
     """
-    batch, *shape = part["shape"]
-    if batch != "batch" or part["dtype"] not in _DTYPES or not 1 <= len(shape) <= 3:
-        raise ValueError(part)
+    batch, *shape = entry["shape"]
+    if batch != "batch" or entry["dtype"] not in _DTYPES or not 1 <= len(shape) <= 3:
+        raise ValueError(entry)
     if not all(is_count(size) and 0 < size < 1 << 16 for size in shape):
         raise ValueError(shape)
-    return tuple(shape), part["dtype"]
+    return tuple(shape), entry["dtype"]

@@ -18,16 +18,16 @@ from jaxrl_vis.run.exported.layers import COMPUTATION, INPUTS, Layers, forward, 
 from jaxrl_vis.run.storage.folder import EXPORT_FOLDER
 from jaxrl_vis.run.trained.policy import Policy, choose_seed, make_policy
 from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
-from jaxrl_vis.run.trained.shipped import find, workplace
+from jaxrl_vis.run.trained.shipped import find, output_folder
 
 _EPISODES = 8
 
 
 class Check(NamedTuple):
-    """Result of a check.
+    """Result of a check of an exported policy.
 
     Attributes:
-        file: The policy.
+        file: Path of the policy.
         difference: Maximum absolute difference from our own actions on the golden frames.
         count: Number of frames.
     """
@@ -60,7 +60,7 @@ def export_run(
         kind: ``onnx``, ``stablehlo`` or ``safetensors``.
         out: The folder; None for export/KIND in the run folder.
         seed, checkpoint, trust: As in `load_policy`.
-        overwrite: Replace an exported policy in ``out``.
+        overwrite: Whether to replace an exported policy in ``out``.
 
     Raises:
         RequestError: The run cannot be used, the policy does not support the format, a library is missing, or ``out`` is not
@@ -72,7 +72,7 @@ def export_run(
     if kind == "onnx":
         onnx_file.require()
     run_dir = find(run_dir)
-    folder = workplace(run_dir) / EXPORT_FOLDER / kind if out is None else Path(out)
+    folder = output_folder(run_dir) / EXPORT_FOLDER / kind if out is None else Path(out)
     _check_folder(folder, overwrite)
     # No other library would reproduce the rounding of networks in bfloat16 or TF32.
     trainer = open_run(run_dir, True, trust, eval_episodes=num_recorded(_EPISODES), compute_dtype="float32")
@@ -87,7 +87,7 @@ def export_run(
 
 
 def _check_folder(folder: Path, overwrite: bool) -> None:
-    """Raise a RequestError if ``folder`` is a file, or has contents that must not be replaced."""
+    """Raise a RequestError if ``folder`` is a file, or has other contents than an exported policy to ``overwrite``."""
     check_writable(folder, "--out", folder=True)
     names = {entry.name for entry in folder.iterdir()} if folder.exists() else set()
     if names and contracts.FILE not in names:
@@ -114,7 +114,11 @@ def _input_ranges(policy: Policy) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 def _write(
     folder: Path, kind: str, policy: Policy, layers: Layers | None, frames: golden.Golden, contract: dict[str, Any]
 ) -> None:
-    """Write the files, the contract last, so that an interrupted export has no contract."""
+    """Write the files, the contract last, so that an interrupted export has no contract.
+
+    Raises:
+        StorageError: A file cannot be written.
+    """
     file, described = folder / FORMATS[kind], folder / contracts.FILE
     contents = b""  # created before existing files are deleted
     if kind == "stablehlo":
@@ -142,7 +146,7 @@ def _write(
 
 
 def check_file(path: Path | str) -> Check:
-    """Run an exported policy on its golden frames.
+    """Run an exported policy on its golden frames, and return the result of the comparison with their actions.
 
     Args:
         path: The policy's file, or its folder.
@@ -164,7 +168,11 @@ def check_file(path: Path | str) -> Check:
 
 
 def _load_program(contract: Contract) -> Any:
-    """Load a policy in ONNX or StableHLO, and compare its inputs and outputs with the contract."""
+    """Load a policy in ONNX or StableHLO, and compare its inputs and outputs with the contract.
+
+    Raises:
+        RequestError: The file cannot be loaded, or does not fit the contract.
+    """
     model = (onnx_file.Model if contract.format == "onnx" else stablehlo.Program)(contract.file)
     tensors = {**model.inputs, **model.outputs}
     for name, (shape, dtype) in contract.forms.items():

@@ -32,7 +32,9 @@ class Golden(NamedTuple):
 
 
 def record(trainer: Trainer, train: TrainState, policy: Policy) -> Golden:
-    """Record frames of the first episodes of an evaluation of a policy; they are the same at every call.
+    """Record 32 frames, evenly spaced over the recorded episodes of an evaluation, with their goals and the policy's actions.
+
+    They are the same at every call.
 
     Args:
         trainer: From `open_run`, with few episodes per evaluation.
@@ -60,7 +62,7 @@ def record(trainer: Trainer, train: TrainState, policy: Policy) -> Golden:
 
 
 def to_bytes(golden: Golden) -> bytes:
-    """Write golden frames as a compressed .npz file."""
+    """Return golden frames as the contents of a compressed .npz file."""
     file = io.BytesIO()
     np.savez_compressed(file, **golden._asdict())
     return file.getvalue()

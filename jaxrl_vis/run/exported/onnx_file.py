@@ -16,7 +16,7 @@ BATCH = "batch"
 
 
 def require() -> tuple[Any, Any]:
-    """Import onnx and onnxruntime.
+    """Import onnx and onnxruntime, and return both modules.
 
     Raises:
         RequestError: One of them is missing.
@@ -69,9 +69,11 @@ def to_bytes(layers: Layers, shape: tuple[int, ...], dtype: np.dtype, about: str
     kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
     inputs = [helper.make_tensor_value_info(name, kind, [BATCH, *shape]) for name in INPUTS]
     outputs = [helper.make_tensor_value_info(OUTPUT, onnx.TensorProto.FLOAT, [BATCH, size])]
-    made = helper.make_graph(graph.nodes, "policy", inputs, outputs, list(graph.initializers.values()))
+    graph_proto = helper.make_graph(graph.nodes, "policy", inputs, outputs, list(graph.initializers.values()))
     opset = [helper.make_opsetid("", _OPSET)]
-    model = helper.make_model(made, producer_name="jaxrl-vis", opset_imports=opset, ir_version=_IR_VERSION, doc_string=about)
+    model = helper.make_model(
+        graph_proto, producer_name="jaxrl-vis", opset_imports=opset, ir_version=_IR_VERSION, doc_string=about
+    )
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()
 

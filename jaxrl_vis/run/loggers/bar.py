@@ -19,7 +19,7 @@ Wordings = Callable[[Task, str, str], Sequence[Sequence[str]]]
 """(task, elapsed time, remaining time) -> texts beside the bar, longest wording first."""
 
 
-def clock(seconds: float | None) -> str:
+def format_clock(seconds: float | None) -> str:
     """Format a duration as ``0:07:30``, with unlimited hours; ``-:--:--`` for None."""
     if seconds is None:
         return "-:--:--"
@@ -48,7 +48,8 @@ class FittingProgress(Progress):
 
     def _line(self, task: Task, width: int) -> RenderableType:
         lines = [
-            _BETWEEN.join(words) for words in self._wordings(task, clock(task.finished_time or task.elapsed), self._left(task))
+            _BETWEEN.join(words)
+            for words in self._wordings(task, format_clock(task.finished_time or task.elapsed), self._left(task))
         ]
         shown = next((line for line in lines if cell_len(line) <= width), lines[-1])
         table = Table.grid(expand=True)
@@ -65,4 +66,4 @@ class FittingProgress(Progress):
 
     @staticmethod
     def _left(task: Task) -> str:
-        return clock(0.0 if task.finished else task.time_remaining)
+        return format_clock(0.0 if task.finished else task.time_remaining)

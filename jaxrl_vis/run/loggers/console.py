@@ -12,13 +12,13 @@ from jaxrl_vis.host import streams
 from jaxrl_vis.run.loggers.bar import FittingProgress
 
 
-def show_shares(values: Sequence[float]) -> str:
+def format_fractions(values: Sequence[float]) -> str:
     """Format fractions: ``0.93`` for one seed; for several, the median and all values: ``0.93 (0.91 0.93 0.96)``."""
     median = f"{statistics.median(values):.2f}"
     return median if len(values) == 1 else f"{median} ({' '.join(f'{value:.2f}' for value in values)})"
 
 
-def show_seconds(seconds: float) -> str:
+def format_seconds(seconds: float) -> str:
     """Format a duration as ``42 s``, ``3 min 5 s`` or ``2 h 10 min``."""
     rounded = round(seconds)
     if rounded < 60:
@@ -50,7 +50,7 @@ class RunConsole:
     """Progress display of a run. A bar appears only if stdout is a terminal; lines are printed above it.
 
     Args:
-        quiet: Suppress all output.
+        quiet: Whether to suppress all output.
     """
 
     def __init__(self, quiet: bool = False):
@@ -82,12 +82,18 @@ class RunConsole:
         self._task = self._bar.add_task("training", total=total, completed=done, success="-", distance="-", speed="-")
 
     def advance(self, done: int, steps_per_second: float) -> None:
-        """Advance the progress bar."""
+        """Advance the progress bar to ``done`` iterations of the whole run, and show the environment steps per second."""
         if self._bar is not None and self._task is not None:
             self._bar.update(self._task, completed=done, speed=f"{steps_per_second:,.0f}")
 
-    def evaluated(self, success: Sequence[float], distance: Sequence[float], unit: str) -> None:
-        """Show the latest evaluation beside the bar."""
+    def show_evaluation(self, success: Sequence[float], distance: Sequence[float], unit: str) -> None:
+        """Show the medians over seeds of the latest evaluation beside the bar.
+
+        Args:
+            success: Success rate of each seed.
+            distance: Distance to the goal of each seed, in ``unit``.
+            unit: Unit of the distances.
+        """
         if self._bar is not None and self._task is not None:
             shown = f"{statistics.median(distance):.3f} {unit}"
             self._bar.update(self._task, success=f"{statistics.median(success):.2f}", distance=shown)

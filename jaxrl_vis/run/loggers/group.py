@@ -90,7 +90,11 @@ class Loggers:
                 self._try(logger_name, lambda logger=logger: logger.image(name, file, env_steps))
 
     def close(self, in_a_hurry: bool = False) -> None:
-        """Close the loggers within a time limit: a library waiting for a network could otherwise block the end of the run."""
+        """Close the loggers within a time limit: a library waiting for a network could otherwise block the end of the run.
+
+        Args:
+            in_a_hurry: True after a signal: each logger gets 10 s instead of 60 s.
+        """
         for name in list(self._open):
             logger = self._open.pop(name)
             thread = threading.Thread(target=self._try, args=(name, logger.close), daemon=True)

@@ -44,7 +44,7 @@ def card(
     scores: Mapping[int, Score],
     unit: str,
     pictures: Mapping[str, str] | None = None,
-    name_here: str | None = None,
+    shipped_name: str | None = None,
     remark: str = "",
 ) -> str:
     """Return the text of the model card (README.md).
@@ -56,7 +56,7 @@ def card(
         scores: Scores by seed; empty if none was evaluated at the iteration of the weights.
         unit: Unit of distances.
         pictures: Image files by caption.
-        name_here: Name of the policy if it ships with the package; None if the folder stands alone and includes metrics.jsonl.
+        shipped_name: Name of the policy if it ships with the package; None if the folder stands alone, with metrics.jsonl.
         remark: Additional sentence about the scores.
     """
     task, name = config.environment.env, f"{config.environment.env}, {config.reward.method}, {config.run.algorithm}"
@@ -88,7 +88,7 @@ def card(
         "```python",
         "import jaxrl_vis",
         "",
-        f'policy = jaxrl_vis.load_policy("{name_here or "FOLDER"}")  # observation, goal -> action in [-1, 1]',
+        f'policy = jaxrl_vis.load_policy("{shipped_name or "FOLDER"}")  # observation, goal -> action in [-1, 1]',
         "```",
         "",
         "## Training",
@@ -100,7 +100,7 @@ def card(
         f"Revision {record.get('git_revision') or 'unknown'}; "
         + ", ".join(f"{package} {versions[package]}" for package in ("python", "jax", "mujoco") if package in versions)
         + f"; {device}. The configuration is in config.json"
-        + ("." if name_here else ", evaluations are in metrics.jsonl."),
+        + ("." if shipped_name else ", evaluations are in metrics.jsonl."),
     ]
     if ":" in task:
         lines += ["", f"The task {task} is code of its own, which is not in this folder."]

@@ -122,7 +122,11 @@ def public_record(run_dir: Path) -> dict[str, Any]:
 
 
 def _upload(folder: Path, repository: str) -> str:
-    """Upload a folder to the hub as a model, and return its address."""
+    """Upload a folder to the hub as a model, and return its address, ``hub:user/name``.
+
+    Raises:
+        RequestError: The hub refuses, or cannot be reached.
+    """
     from huggingface_hub import HfApi  # pyright: ignore[reportMissingImports]
 
     try:

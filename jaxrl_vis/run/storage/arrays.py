@@ -30,8 +30,8 @@ def to_host(tree: Any, copy: bool) -> Arrays:
 
     Args:
         tree: Arrays on a device.
-        copy: False: on a CPU, return views of the device's memory. A view is valid only until the arrays are donated, and while
-            one exists, the next donation makes a copy.
+        copy: Whether to copy. If not, arrays on a CPU are views of the device's memory: a view is valid only until the arrays
+            are donated, and while one exists, the next donation makes a copy.
     """
 
     def convert(leaf: jax.Array) -> np.ndarray:
@@ -53,14 +53,14 @@ def _checksum(array: np.ndarray) -> int:
 
 def describe(arrays: dict[str, Any]) -> dict[str, list]:
     """Describe arrays for a manifest: shape, dtype and checksum, by name."""
-    if distributed.are_several():
+    if distributed.is_multi_process():
         return _describe_parts(arrays)
     return {name: [list(array.shape), str(array.dtype), _checksum(array)] for name, array in arrays.items()}
 
 
-def to_save(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
+def saved_leaves(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
     """Return the leaves of a pytree by name, as saved by orbax; with several processes, each writes its own parts."""
-    if not distributed.are_several():
+    if not distributed.is_multi_process():
         return to_host(tree, copy)
     return {
         name: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
@@ -108,18 +108,18 @@ def _row_checksum(array: np.ndarray, axes: int, start: Sequence[int] = ()) -> in
 
 
 def is_intact(array: np.ndarray, described: list) -> bool:
-    """Return True if an array matches its description in the manifest."""
+    """Return True if an array has the checksum of its description in the manifest (`describe`)."""
     _, _, checksum, *axes = described
     return checksum == (_row_checksum(array, axes[0]) if axes else _checksum(array))
 
 
-def _is_folded(one: Sequence[int], other: Sequence[int]) -> bool:
+def _is_folded(first: Sequence[int], second: Sequence[int]) -> bool:
     """Return True for shapes [S, rollouts, E, ...] and [S, rollouts * E, ...] of the same episodes (`sharding.Layout`)."""
-    (start, *rest), (folded_start, *fold_replay) = sorted((tuple(one), tuple(other)), key=len)
-    return len(fold_replay) >= 2 and start == folded_start and rest == [fold_replay[0] * fold_replay[1], *fold_replay[2:]]
+    (seeds, *rest), (other_seeds, *unfolded) = sorted((tuple(first), tuple(second)), key=len)
+    return len(unfolded) >= 2 and seeds == other_seeds and rest == [unfolded[0] * unfolded[1], *unfolded[2:]]
 
 
-def as_saved(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:
+def restore_target(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:
     """Return orbax's restore target for an array that was saved with ``shape``.
 
     This is ``expected`` if it has that shape and lies on a single device, else a NumPy array of the saved shape, which is
@@ -144,7 +144,7 @@ def host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
 
 
 def rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
-    """Invert `to_host`: builds a tree like ``template``, which also defines where its arrays are placed."""
+    """Invert `to_host`: build a tree like ``template``, which also defines where its arrays are placed."""
 
     def convert(path: Any, leaf: Any) -> jax.Array:
         array, sharding = arrays[jax.tree_util.keystr(path, simple=True, separator=".")], getattr(leaf, "sharding", None)

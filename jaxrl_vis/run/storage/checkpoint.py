@@ -28,7 +28,7 @@ from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.host import distributed, streams
 from jaxrl_vis.host.files import read_json
 from jaxrl_vis.run.storage import hush, restoring, sums
-from jaxrl_vis.run.storage.arrays import describe, to_save
+from jaxrl_vis.run.storage.arrays import describe, saved_leaves
 from jaxrl_vis.run.storage.manifest import FILE, SCHEMA
 from jaxrl_vis.run.storage.metrics import RUN_ID
 from jaxrl_vis.run.storage.recent import ANY_RUN, Recent, Unusable
@@ -57,7 +57,7 @@ class Checkpoints:
     Args:
         folder: Folder of the tiers; created by the first save.
         echo: Called with one line about each unusable checkpoint.
-        read_only: Never save: nothing is created or cleaned up.
+        read_only: Whether to only read: nothing is saved, created or cleaned up.
 
     Attributes:
         run_id: Id of the run: other runs' checkpoints are ignored, except by
@@ -102,7 +102,7 @@ class Checkpoints:
             # waits for its own disk indefinitely; with several, one that hangs must be detected.
             patient = AsyncOptions(timeout_secs=_TIMEOUT_S, create_directories_asynchronously=False)
             options = ocp.CheckpointManagerOptions(
-                async_options=None if distributed.are_several() else patient,
+                async_options=None if distributed.is_multi_process() else patient,
                 # The best one may be older than the one that it replaces, see `save_best`.
                 preservation_policy=None if self._read_only or tier == BEST else LatestN(_KEPT),
                 cleanup_tmp_directories=not self._read_only,
@@ -146,11 +146,11 @@ class Checkpoints:
             train: The learner, [S, ...].
             progress: A JSON value.
         """
-        self._save(LIGHT, iteration, {"train": to_save(train, copy=True)}, progress)
+        self._save(LIGHT, iteration, {"train": saved_leaves(train, copy=True)}, progress)
 
     def save_best(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
         """Write the learner, wait for the disk, then delete the previous best checkpoint. See `save_light`."""
-        self._save(BEST, iteration, {"train": to_save(train, copy=False)}, progress)
+        self._save(BEST, iteration, {"train": saved_leaves(train, copy=False)}, progress)
         self.wait()
         for earlier in self.iterations(BEST):
             if earlier != iteration:
@@ -160,7 +160,10 @@ class Checkpoints:
 
     def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
         """Write the complete state and wait for the disk: an asynchronous copy of the replay would need memory for two."""
-        items = {"train": to_save(loop.train, copy=False), "rest": to_save(state_without_learner(loop), copy=False)}
+        items = {
+            "train": saved_leaves(loop.train, copy=False),
+            "rest": saved_leaves(state_without_learner(loop), copy=False),
+        }
         self._save(FULL, iteration, items, progress)
         self.wait()
 
@@ -171,7 +174,7 @@ class Checkpoints:
         manifest = {"schema": SCHEMA, RUN_ID: self.run_id, "iteration": iteration, "items": described, "progress": progress}
         arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
         arguments["manifest"] = ocp.args.JsonSave(manifest)
-        if distributed.are_several():
+        if distributed.is_multi_process():
             self.wait()  # with two tiers written concurrently, processes would confuse one with the other
         with self._storage_errors(tier):
             manager = self._manager(tier)
@@ -203,13 +206,13 @@ class Checkpoints:
 
     def _put_aside(self, tier: str, iteration: int) -> None:
         """Move a checkpoint aside, where `_recover` finds it if the process is killed before the replacement is complete."""
-        distributed.meet("replacing")
+        distributed.sync_processes("replacing")
         if distributed.is_first():
             aside = self._replaced_path(tier, iteration)
             aside.parent.mkdir(exist_ok=True)
             shutil.rmtree(aside, ignore_errors=True)
             (self._folder / tier / str(iteration)).rename(aside)
-        distributed.meet("replaced")
+        distributed.sync_processes("replaced")
 
     def _recover(self) -> None:
         """Move checkpoints back whose replacement was not completed, and delete those that were replaced."""
@@ -222,7 +225,7 @@ class Checkpoints:
                 shutil.rmtree(aside, ignore_errors=True)
             else:
                 aside.rename(place)
-        distributed.meet("recovered")
+        distributed.sync_processes("recovered")
 
     @contextlib.contextmanager
     def _storage_errors(self, tier: str) -> Iterator[None]:
@@ -265,7 +268,7 @@ class Checkpoints:
         Recent states that are no longer kept up to date are also deleted.
 
         Args:
-            has_ended: Also delete equally new ones: the run is complete.
+            has_ended: Whether to delete equally new ones, too, because the run is complete.
         """
         newest = max(self.iterations(LIGHT), default=-1)
         if distributed.is_first():
@@ -277,21 +280,13 @@ class Checkpoints:
                     shutil.rmtree(self._folder / FULL / str(iteration), ignore_errors=True)
 
     def set_aside_after(self, iteration: int) -> list[Path]:
-        """Move checkpoints after ``iteration``, which are unusable, to checkpoints/damaged/.
-
-        Returns:
-            Where they are now.
-        """
+        """Move checkpoints after ``iteration``, which are unusable, to checkpoints/damaged/; return their new paths."""
         tiers = {tier: self.iterations(tier) for tier in (LIGHT, FULL, RECENT)}
         later = {tier: [number for number in iterations if number > iteration] for tier, iterations in tiers.items()}
         return self._move(later, DAMAGED)
 
     def set_foreign_aside(self) -> list[Path]:
-        """Move checkpoints of other runs to checkpoints/foreign/, where they do not count towards the number that is kept.
-
-        Returns:
-            Where they are now.
-        """
+        """Move checkpoints of other runs to checkpoints/foreign/, where they are not counted; return their new paths."""
         foreign = {tier: [number for number, is_ours in self._list(tier) if not is_ours] for tier in (LIGHT, FULL, BEST)}
         moved = self._move(foreign, FOREIGN)
         recent = _unused_path(self._folder / FOREIGN / RECENT)

@@ -20,12 +20,12 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.config import RESUMABLE, Config, Mark, config_from_dict, marked, of_weightings
+from jaxrl_vis.config import RESUMABLE, Config, Mark, config_from_dict, marked, weighting_options
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import check_path, is_temporary, read_json, write_atomically
 from jaxrl_vis.run.storage.lock import FILE_NAME as LOCK_NAME
-from jaxrl_vis.run.storage.lock import FolderGoneError, Held
+from jaxrl_vis.run.storage.lock import FolderGoneError, HeldLock
 from jaxrl_vis.run.storage.metrics import RUN_ID, read_rows
 
 SCHEMA = 2
@@ -52,15 +52,15 @@ def default_folder(config: Config) -> Path:
     return Path("runs") / f"{config.environment.env.replace(':', '-')}-{config.reward.method}-{config.run.preset}-{seeds}"
 
 
-def check_there(path: Path, resume: bool) -> None:
-    """Raise a `RequestError` if a run is to be resumed in a missing folder."""
+def check_resumable(path: Path, resume: bool) -> None:
+    """Raise a `RequestError` if ``path`` cannot be a run folder, or if a run is to be resumed in a missing folder."""
     _check_run_path(path)
     if resume and not path.exists():
         raise RequestError(f"nothing to resume: there is no folder {path}; leave out --resume to start a run there")
 
 
 def _check_run_path(path: Path) -> None:
-    """Check that ``path`` can be a run folder: orbax accepts only names in UTF-8."""
+    """Raise a `RequestError` if ``path`` cannot be a run folder: orbax accepts only names in UTF-8."""
     check_path(path / "config.json")
     try:
         str(path.resolve()).encode()
@@ -83,37 +83,37 @@ class RunFolder:
 
     @property
     def config(self) -> Path:
-        """Configuration of the run, with versions and device."""
+        """Path of the run's configuration, with versions and device."""
         return self.path / "config.json"
 
     @property
     def metrics(self) -> Path:
-        """One line per seed and evaluation."""
+        """Path of the metrics, one line per seed and evaluation."""
         return self.path / "metrics.jsonl"
 
     @property
     def processes(self) -> Path:
-        """One line per process: the number of iterations that it has begun."""
+        """Path of the number of iterations that each process has begun, one line per process."""
         return self.path / "processes.jsonl"
 
     @property
     def checkpoints(self) -> Path:
-        """Tiers of checkpoints."""
+        """Path of the folder with the tiers of checkpoints."""
         return self.path / "checkpoints"
 
     @property
     def nonfinite(self) -> Path:
-        """Dumped states with non-finite numbers."""
+        """Path of the folder with dumped states that have non-finite numbers."""
         return self.path / "nonfinite"
 
     @property
     def curve(self) -> Path:
-        """Success and distance against environment steps."""
+        """Path of the plot of success and distance against environment steps."""
         return self.path / "curve.png"
 
     @property
     def video(self) -> Path:
-        """Episodes of the trained policy."""
+        """Path of the video of the trained policy's episodes."""
         return self.path / "video.gif"
 
     def rows(self) -> list[dict[str, Any]]:
@@ -131,7 +131,7 @@ class RunFolder:
             return rows
         return [row for row in rows if row.get(RUN_ID) == run_id]
 
-    def check_place(self, lock: Held) -> None:
+    def check_place(self, lock: HeldLock) -> None:
         """Check that the folder is still in place since it was locked, before the run starts.
 
         Args:
@@ -144,7 +144,7 @@ class RunFolder:
         if not lock.is_in_place():
             raise FolderGoneError(_where_gone(self.path, lock.current_path(), "before the run began"))
 
-    def check_ours(self, run_id: str, lock: Held) -> None:
+    def check_ownership(self, run_id: str, lock: HeldLock) -> None:
         """Check that the folder still belongs to a run, before writing into it.
 
         Args:
@@ -179,6 +179,10 @@ class RunFolder:
     def check(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
         """Check whether this folder may be used for ``config``. Changes nothing.
 
+        Args:
+            config: The requested configuration.
+            resume, overwrite: Whether an earlier run may be resumed, or deleted.
+
         Returns:
             True if an earlier run is to be resumed, False if a new run starts.
 
@@ -188,7 +192,7 @@ class RunFolder:
         """
         if resume and overwrite:
             raise RequestError("--resume and --overwrite contradict each other: give one of them")
-        check_there(self.path, resume)
+        check_resumable(self.path, resume)
         if self.path.exists() and not self.path.is_dir():
             raise RequestError(f"{self.path} is a file: choose another --run-dir")
         try:
@@ -210,6 +214,11 @@ class RunFolder:
         """Run `check`, then prepare the folder: with ``overwrite``, an earlier run's files are deleted, and nothing else.
 
         Call it last, after all other checks of the request.
+
+        Args:
+            config: Configuration to record in config.json.
+            resume, overwrite: Whether to resume an earlier run, or to delete it.
+            log: Names of the loggers to record.
 
         Returns:
             True if an earlier run is to be resumed.
@@ -325,7 +334,11 @@ def read_run_id(path: Path) -> str:
 
 
 def read_log(path: Path) -> tuple[str, ...]:
-    """Read the loggers of the run in ``path``; none if there is no run."""
+    """Read the names of the loggers of the run in ``path``; empty if there is no run.
+
+    Raises:
+        RequestError: config.json cannot be read, or its list of loggers is invalid.
+    """
     check_path(path)
     log = read_record(path).get("log", []) if RunFolder(path).config.exists() else []
     if not isinstance(log, list) or not all(isinstance(name, str) for name in log):
@@ -355,7 +368,7 @@ def contradictions(saved: Config, config: Config, ignored: Mark = RESUMABLE) -> 
     """
     before, requested, but_for = saved.flat(), config.flat(), marked(ignored)
     # Options of weightings are not read if losses are neither weighted nor logarithmic.
-    unread = of_weightings() if saved.auxiliary.weighting == config.auxiliary.weighting == "none" else ()
+    unread = weighting_options() if saved.auxiliary.weighting == config.auxiliary.weighting == "none" else ()
     return [
         f"{name} (saved {before[name]}, asked {requested[name]})"
         for name in sorted(before)

@@ -35,7 +35,7 @@ class FolderGoneError(StorageError):
     """Loss of the run folder: moved, deleted, or taken over. One line: the cause, and how to continue."""
 
 
-class Held:
+class HeldLock:
     """Lock of a run folder held by this process.
 
     Args:
@@ -100,7 +100,7 @@ class Held:
 
 
 @contextlib.contextmanager
-def run_lock(folder: Path, echo: Callable[[str], None] = print) -> Iterator[Held]:
+def run_lock(folder: Path, echo: Callable[[str], None] = print) -> Iterator[HeldLock]:
     """Lock a run folder; create it if missing, and remove it again if it is still empty at the end.
 
     Args:
@@ -113,7 +113,7 @@ def run_lock(folder: Path, echo: Callable[[str], None] = print) -> Iterator[Held
     path = folder / FILE_NAME
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        held = Held(folder)
+        held = HeldLock(folder)
     except OSError as error:
         raise _unwritable(folder, error) from error
     try:
@@ -175,7 +175,7 @@ def _release(lock: filelock.BaseFileLock, path: Path, status: os.stat_result) ->
     lock.release()
 
 
-def _lock_by_marker(path: Path, lock: Held, echo: Callable[[str], None], stack: contextlib.ExitStack) -> None:
+def _lock_by_marker(path: Path, lock: HeldLock, echo: Callable[[str], None], stack: contextlib.ExitStack) -> None:
     """Use the file itself as the lock until the end of ``stack``.
 
     Raises:

@@ -20,7 +20,7 @@ from jaxrl_vis.host.files import is_count, sync_folder, write_atomically
 from jaxrl_vis_envs.documents import parse_json
 
 PerSeed = dict[str, list[float]]
-"""Maps names to one number per seed."""
+"""One number per seed, by name."""
 
 Row = Mapping[str, Any]
 """A line of the file."""
@@ -29,8 +29,8 @@ RUN_ID = "run_id"
 """Key of the run's id in a row, a checkpoint's manifest or a config.json."""
 
 
-class Place(NamedTuple):
-    """Place of a row in a training run: keys that every row has.
+class RowKeys(NamedTuple):
+    """Keys that every row has, which identify it in a training run.
 
     Attributes:
         seed: Seed.
@@ -45,13 +45,13 @@ class Place(NamedTuple):
     env_steps: int
 
 
-_NO_FIGURES = {*Place._fields, RUN_ID} - {"updates"}
+_NO_FIGURES = {*RowKeys._fields, RUN_ID} - {"updates"}
 _MAX_VALUE = 2**63  # of a number in a row: the range of integer arrays
 _SHOWN = 8  # line numbers in a message
 
 
 def average_metrics(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed:
-    """Average metrics over the iterations in ``history``, seed by seed.
+    """Average metrics over the iterations in ``history``, seed by seed, with nine significant digits.
 
     The order of summation is fixed, so that a resumed run writes the same digits as an uninterrupted one.
     """
@@ -59,25 +59,27 @@ def average_metrics(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed
         return {}
     return {
         name: [
-            _nine_digits(math.fsum(values) / len(history)) for values in zip(*(entry[name] for entry in history), strict=True)
+            _round_digits(math.fsum(values) / len(history)) for values in zip(*(entry[name] for entry in history), strict=True)
         ]
         for name in history[0]
     }
 
 
 def with_precision(metrics: PerSeed) -> PerSeed:
-    """Add the precision of the filter to ``metrics``: the fraction of the dropped negatives that were false; NaN if none.
+    """Return ``metrics`` with the precision of the filter: the fraction of dropped negatives that were false; NaN if none.
+
+    Without statistics of a filter, ``metrics`` are returned unchanged.
 
     This is a ratio of means, not a mean of ratios: the fraction among all dropped samples.
     """
     if "train/filtered_false_share" not in metrics:
         return metrics
     pairs = zip(metrics["train/filtered_false_share"], metrics["train/filtered_share"], strict=True)
-    precision = [_nine_digits(false / dropped) if dropped > 0.0 else math.nan for false, dropped in pairs]
+    precision = [_round_digits(false / dropped) if dropped > 0.0 else math.nan for false, dropped in pairs]
     return {**metrics, "train/filter_precision": precision}
 
 
-def _nine_digits(value: float) -> float:
+def _round_digits(value: float) -> float:
     # The precision of a float32, so that the file stays readable.
     return float(f"{value:.9g}")
 
@@ -91,7 +93,7 @@ def make_rows(seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[s
 
 
 def scalars(row: Row) -> dict[str, float]:
-    """Return the figures of a row by name, without those that were not finite."""
+    """Return the metrics of a row and its ``updates`` by name, without those that were not finite."""
     return {name: float(value) for name, value in row.items() if name not in _NO_FIGURES and value is not None}
 
 
@@ -101,7 +103,7 @@ class Contents:
 
     Attributes:
         rows: The rows, in the order of their iterations.
-        damaged: Number and bytes of every line that is not a valid row, or repeats an earlier row.
+        damaged: Line number, from 1, and bytes of every line that is not a valid row, or repeats an earlier row.
         torn: Incomplete last line without a line break. After a kill, that row was never complete.
     """
 
@@ -111,7 +113,11 @@ class Contents:
 
 
 def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Append rows to the file and sync them to the disk."""
+    """Append rows to the file and sync them to the disk.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     _append(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
 
 
@@ -142,9 +148,9 @@ def read_contents(path: Path) -> Contents:
     for number, line in enumerate([*lines, last], 1):
         is_last = number > len(lines)  # not terminated by a line break
         row = _read_row(line)
-        place = None if row is None else (row["iteration"], row["seed"], row.get(RUN_ID))
-        if row is not None and place is not None and place not in rows:
-            rows[place] = row
+        key = None if row is None else (row["iteration"], row["seed"], row.get(RUN_ID))
+        if row is not None and key is not None and key not in rows:
+            rows[key] = row
         elif is_last and row is None:
             torn = line.strip()
         elif line.strip():
@@ -158,7 +164,7 @@ def _read_row(line: bytes) -> dict[str, Any] | None:
         row = parse_json(line.decode("utf-8"))
     except ValueError:
         return None
-    if not isinstance(row, dict) or not all(is_count(row.get(name)) for name in Place._fields):
+    if not isinstance(row, dict) or not all(is_count(row.get(name)) for name in RowKeys._fields):
         return None
     if not isinstance(row.get(RUN_ID), str | None):
         return None
@@ -180,7 +186,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return read_contents(path).rows
 
 
-def cut_back(
+def truncate(
     path: Path, iteration: int, run_id: str, aside: Path, others: Path, keeps_later: bool, evaluated: int = 0
 ) -> str | None:
     """Remove the rows after ``iteration``, which a resumed run writes again, and the rows of other runs.
@@ -191,7 +197,7 @@ def cut_back(
         run_id: Id of the run.
         aside: File to which damaged lines are moved; nothing is discarded.
         others: File to which other runs' rows are moved.
-        keeps_later: Also move rows after ``iteration`` to ``aside``.
+        keeps_later: Whether to move rows after ``iteration`` to ``aside``, instead of discarding them.
         evaluated: Last iteration known to have had a row of each seed, or 0: if one is missing, a torn line is that row.
 
     Returns:
@@ -211,8 +217,8 @@ def cut_back(
     evaluated_seeds = {row["seed"] for row in rows if row["iteration"] == evaluated}
     if contents.torn and evaluated and (not evaluated_seeds or evaluated_seeds < {row["seed"] for row in rows}):
         damaged.append((path.read_bytes().count(b"\n") + 1, contents.torn))
-    _keep(aside, [line for _, line in damaged] + [json.dumps(row).encode() for row in later])
-    _keep(others, [json.dumps(row).encode() for row in foreign])
+    _append_lines(aside, [line for _, line in damaged] + [json.dumps(row).encode() for row in later])
+    _append_lines(others, [json.dumps(row).encode() for row in foreign])
     text = "".join(json.dumps(row) + "\n" for row in rows if row["iteration"] <= iteration)
     if text.encode() != path.read_bytes():
         write_atomically(path, text)
@@ -221,7 +227,7 @@ def cut_back(
     return f"{path.name} held {', and '.join(findings)}; left out here" if findings else None
 
 
-def _keep(path: Path, lines: Sequence[bytes]) -> None:
+def _append_lines(path: Path, lines: Sequence[bytes]) -> None:
     if lines:
         path.parent.mkdir(parents=True, exist_ok=True)
         _append(path, b"".join(line + b"\n" for line in lines))

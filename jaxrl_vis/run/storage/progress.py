@@ -10,11 +10,11 @@ from jaxrl_vis.run.storage.metrics import PerSeed
 
 @dataclasses.dataclass
 class Progress:
-    """Host side of a run's state.
+    """Part of a run's state that is kept on the host.
 
     Attributes:
-        wall_s: Wall-clock time of earlier processes, s; a saved copy includes the process that saved it.
-        compile_s: Compilation time of all processes so far, s.
+        wall_s: Wall-clock time of earlier processes in seconds; a saved copy includes the process that saved it.
+        compile_s: Compilation time of all processes so far, in seconds.
         since_evaluation: train/* and other metrics of every iteration since the last scheduled evaluation.
         evaluation_due: True while the evaluation at the current iteration is still to be run, or its rows are not yet written.
         filtered: Number of consecutive evaluations with too large a fraction of filtered negatives.

@@ -64,13 +64,13 @@ class Recent:
         self._rollouts: dict[int, int] = {}  # rollouts known to exist, and their checksums
         self._cost, self._saved_at, self._is_off = 0.0, -np.inf, False
 
-    def is_due(self, in_any_case: bool) -> bool:
+    def is_due(self, ignore_time: bool) -> bool:
         """Return True if enough time has passed since the last save for saving to take only a small fraction of it.
 
         Args:
-            in_any_case: Ignore the time since the last save.
+            ignore_time: Whether to ignore the time since the last save.
         """
-        return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _FRACTION)
+        return not self._is_off and (ignore_time or time.monotonic() - self._saved_at >= self._cost / _FRACTION)
 
     def iterations(self) -> list[int]:
         """Return the iterations of this run's states, ascending, including damaged ones."""
@@ -144,12 +144,12 @@ class Recent:
                 file.write(_bytes(array))
         self._remove_stale_files()
 
-    def _write_rollout(self, number: int, parts: Arrays) -> int:
+    def _write_rollout(self, number: int, arrays: Arrays) -> int:
         """Write the episodes of one rollout, arrays [S, E, ...] one after the other; return their checksum."""
         checksum = 0
         with _appearing(self._path(number, "rollout")) as file:
-            for part in parts.values():
-                contents = _bytes(part)
+            for array in arrays.values():
+                contents = _bytes(array)
                 checksum = zlib.crc32(contents, checksum)
                 file.write(contents)
         return checksum
@@ -175,7 +175,7 @@ class Recent:
         return self._header(iteration)
 
     def restore(self, iteration: int, template: LoopState) -> tuple[LoopState, dict[str, Any]]:
-        """Restore a state, and the progress that was saved with it.
+        """Restore a state; return it, and the progress that was saved with it.
 
         Args:
             iteration: One of `iterations`.
@@ -203,7 +203,7 @@ class Recent:
         return loop, header["progress"]
 
     def _read_rollouts(self, checksums: dict[str, int], episodes: Arrays) -> None:
-        """Fill ``episodes``, arrays [S, N, ...], from the rollouts' files."""
+        """Fill ``episodes``, arrays [S, N, ...], from the rollouts' files in place; raise `Unusable` if one is damaged."""
         num_episodes = next(iter(episodes.values())).shape[1]
         for number, checksum in checksums.items():
             contents = self._read(self._path(int(number), "rollout"))
@@ -217,7 +217,7 @@ class Recent:
                 array[:, start : start + num_envs], offset = _array(contents, offset, shape, array.dtype)
 
     def resume_from(self, iteration: int | None) -> None:
-        """Prepare for resuming from the state of an iteration, and delete later rollouts; None: from no state; delete all."""
+        """Prepare for resuming from the state of an iteration, and delete later rollouts; if it is None, delete all files."""
         if iteration is None:
             self.clear()
             return
@@ -249,7 +249,7 @@ class Recent:
             self._folder.rmdir()
 
     def set_aside(self, iteration: int, to: Path) -> None:
-        """Move the state of an iteration."""
+        """Move the state file of an iteration to the path ``to``."""
         self._path(iteration, "state").replace(to)
 
     def _header(self, iteration: int) -> dict[str, Any]:
@@ -271,11 +271,11 @@ class Recent:
         except OSError as error:
             raise Unusable(f"{path.name}: {error.strerror or type(error).__name__}") from None
 
-    def _path(self, iteration: int, kind: str) -> Path:
-        return self._folder / f"{iteration}.{kind}"
+    def _path(self, iteration: int, extension: str) -> Path:
+        return self._folder / f"{iteration}.{extension}"
 
 
-def names_of_others(folder: Path) -> list[str]:
+def foreign_names(folder: Path) -> list[str]:
     """Return the names of foreign files in a folder of recent states; empty if there is no folder."""
     kinds = (".state", ".rollout")
     entries = folder.iterdir() if folder.is_dir() else ()
@@ -283,9 +283,9 @@ def names_of_others(folder: Path) -> list[str]:
     return sorted(name for name, path in bare.items() if not (path.suffix in kinds and path.stem.isdigit()))
 
 
-def _numbers(folder: Path, kind: str) -> list[int]:
+def _numbers(folder: Path, extension: str) -> list[int]:
     try:
-        return [int(file.stem) for file in folder.iterdir() if file.suffix == f".{kind}" and file.stem.isdigit()]
+        return [int(file.stem) for file in folder.iterdir() if file.suffix == f".{extension}" and file.stem.isdigit()]
     except OSError:
         return []
 
@@ -304,7 +304,7 @@ def _bytes(array: np.ndarray) -> memoryview:
 
 
 def _array(contents: bytes, offset: int, shape: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, int]:
-    """Return the array of the given shape and dtype at an offset, and the offset of its end."""
+    """Return the array of the given shape and dtype at an offset, and the offset of its end; raise `Unusable` if cut off."""
     count = int(np.prod(shape))
     end = offset + count * np.dtype(dtype).itemsize
     if end > len(contents):

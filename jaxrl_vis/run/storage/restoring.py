@@ -12,7 +12,7 @@ from typing import Any
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.storage import sums
-from jaxrl_vis.run.storage.arrays import as_saved, check_structure, host_specs, is_intact, rebuild, to_host
+from jaxrl_vis.run.storage.arrays import check_structure, host_specs, is_intact, rebuild, restore_target, to_host
 from jaxrl_vis.run.storage.manifest import SCHEMA, is_manifest
 from jaxrl_vis.run.storage.recent import Unusable
 from jaxrl_vis.types import LoopState, TrainState
@@ -28,7 +28,7 @@ class Restored:
         tier: `LIGHT`, `FULL`, `RECENT` or `BEST`.
         iteration: Iterations completed.
         train: The learner, [S, ...].
-        loop: The complete state; None from the light tier.
+        loop: The complete state; None if only the learner was restored, as from the light tier.
         progress: Progress that was saved with it.
     """
 
@@ -79,14 +79,14 @@ def read_manifest(read: Read, where: Path) -> dict[str, Any]:
 def restore_items(
     read: Read, where: Path, manifest: dict[str, Any], template: LoopState, with_replay: bool
 ) -> tuple[TrainState, LoopState | None]:
-    """Restore the learner, and with the replay the complete state, of the checkpoint at ``where``.
+    """Restore the checkpoint at ``where``; return the learner, and the complete state or None.
 
     Args:
         read: See the module.
         where: Folder of the checkpoint.
         manifest: Its manifest.
         template: Shapes and dtypes of the loop state.
-        with_replay: Also restore all that is not the learner; otherwise the second result is None.
+        with_replay: Whether to restore the replay, keys and iteration, too; otherwise the second result is None.
 
     Raises:
         Unusable: It is damaged.
@@ -99,7 +99,7 @@ def restore_items(
     for name, spec in specs.items():
         with _damage_first(where):
             check_structure(where, manifest["items"].get(name, {}), spec)
-        specs[name] = {leaf: as_saved(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
+        specs[name] = {leaf: restore_target(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
     items = read({name: ocp.args.StandardRestore(spec) for name, spec in specs.items()})
     trees = {}
     for name, tree in templates.items():

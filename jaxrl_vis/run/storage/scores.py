@@ -13,14 +13,14 @@ from jaxrl_vis.config import Config
 _LOWER_IS_BETTER = ("goal_distance", "goal_distance_median")
 
 
-def metric(config: Config) -> str:
+def metric_name(config: Config) -> str:
     """Return the name of the metric that the score averages, without ``eval/``."""
     return config.run.best_by or "success"
 
 
 def is_lower_better(config: Config) -> bool:
     """Return True if smaller scores are better, as for distances."""
-    return metric(config) in _LOWER_IS_BETTER
+    return metric_name(config) in _LOWER_IS_BETTER
 
 
 def score(config: Config, values: Mapping[str, Sequence[float]]) -> float:
@@ -30,7 +30,7 @@ def score(config: Config, values: Mapping[str, Sequence[float]]) -> float:
         config: The run.
         values: ``eval/*``, one number per seed.
     """
-    per_seed = values[f"eval/{metric(config)}"]
+    per_seed = values[f"eval/{metric_name(config)}"]
     return math.fsum(per_seed) / len(per_seed)
 
 
@@ -57,7 +57,7 @@ def enough_at(config: Config, rows: Sequence[Mapping[str, Any]], seeds: Collecti
         rows: Rows of metrics.jsonl.
         seeds: Seeds of the run; evaluations without rows of all of them are ignored.
     """
-    name = f"eval/{metric(config)}"
+    name = f"eval/{metric_name(config)}"
     by_iteration: dict[int, dict[int, float]] = {}
     for row in rows:
         if isinstance(row.get(name), int | float) and row["seed"] in seeds:

@@ -30,7 +30,7 @@ _SHOWN = 160  # side of an image on the page, px
 
 
 def require() -> Any:
-    """Import viser.
+    """Import viser, and return the module.
 
     Raises:
         RequestError: viser is missing.
@@ -78,9 +78,11 @@ class Session:
             state = env.advance(state, act(parameters, observation[None], aim(parameters, goal[None]))[0])
             return state, env.observe(state)
 
-        self._begin, self._look, self._step, self._place = map(jaxrl_vis_envs.jit, (begin, look, step, env.goal_configuration))
+        self._begin, self._look, self._step, self._configure_goal = map(
+            jaxrl_vis_envs.jit, (begin, look, step, env.goal_configuration)
+        )
         self.reset()
-        self.new_goal()
+        self.sample_goal()
 
     @property
     def distance(self) -> float:
@@ -95,7 +97,7 @@ class Session:
             self.state = self.state.replace(goal_state=goal_state)
         self.observation, _ = self._look(self.state.data)
 
-    def new_goal(self) -> None:
+    def sample_goal(self) -> None:
         """Sample a goal as at the start of an episode; the robot keeps its pose."""
         _, goal_data = self._begin(next(self._keys))
         self._update_goal(goal_data)
@@ -108,7 +110,7 @@ class Session:
         """
         assert self.env.goal_box is not None
         low, high = self.env.goal_box
-        self._update_goal(self._place(jnp.asarray(np.clip(point, low, high), jnp.float32)))
+        self._update_goal(self._configure_goal(jnp.asarray(np.clip(point, low, high), jnp.float32)))
 
     def _update_goal(self, goal_data: Any) -> None:
         image, goal_state = self._look(goal_data)
@@ -132,7 +134,7 @@ class Page:
 
     def __init__(self, server: Any, session: Session, title: str, out: Path):
         self._server, self._session, self._out = server, session, out
-        self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._recorded: list[tuple[np.ndarray, bool]] | None = None
         self._dragged: np.ndarray | None = None
         self._note, self._is_dragging = "", False
@@ -153,7 +155,7 @@ class Page:
         self._status = gui.add_markdown("")
         if self._handle is not None:
             gui.add_markdown("Drag the arrows in the scene: the green robot is the goal.")
-        self._add_button("New goal", session.new_goal)
+        self._add_button("New goal", session.sample_goal)
         self._add_button("Reset the robot", session.reset)
         if self._shows_images:
             self._add_button("Record an episode", self._begin_recording)
@@ -175,7 +177,7 @@ class Page:
         goal = self._session.goal
         with contextlib.suppress(queue.Empty):
             while True:
-                self._asked.get_nowait()()
+                self._requests.get_nowait()()
         if self._session.goal is not goal:
             self._show_goal()
         self._record()
@@ -196,15 +198,15 @@ class Page:
     def drag(self, point: np.ndarray) -> None:
         """Request a goal at a point [3] (m, world frame); the latest request since the last step counts."""
         self._dragged = point
-        self._asked.put(self._place)
+        self._requests.put(self._move_goal)
 
-    def _place(self) -> None:
+    def _move_goal(self) -> None:
         if self._dragged is not None:
             point, self._dragged, self._is_dragging = self._dragged, None, True
             self._session.place_goal(point)
 
     def _add_button(self, label: str, action: Callable[[], None]) -> None:
-        self._server.gui.add_button(label).on_click(lambda _: self._asked.put(action))
+        self._server.gui.add_button(label).on_click(lambda _: self._requests.put(action))
 
     def _show_goal(self) -> None:
         session = self._session

@@ -36,8 +36,8 @@ def play_auxiliary(
         run_dir: The run folder.
         out: .gif, .mp4 (needs imageio-ffmpeg, the extra ``video``) or .html.
         episodes: Number of episodes.
-        trust: As in `trained.open_run`.
-        checkpoint: The checkpoint.
+        trust: As in `restored_run.open_run`.
+        checkpoint: See `restored_run.Choice`.
 
     Raises:
         RequestError: There is no run, no usable checkpoint, no auxiliary task to show, or ``out`` cannot be written.
@@ -126,7 +126,7 @@ def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episod
 
 
 def _as_image(networks: Networks, train: TrainState, values: jax.Array) -> jax.Array:
-    """Convert normalised images [T, C or 1, H, W] to grey levels, uint8."""
+    """Convert normalised images [T, C or 1, H, W] to uint8; a single grey channel is scaled linearly instead."""
     mean, scale = networks.scaling(train.normalizer)
     height, width = values.shape[-2:]
     if values.shape[1] == mean.shape[0]:

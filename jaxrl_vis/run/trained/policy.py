@@ -91,16 +91,16 @@ class Policy:
     def _check(self, name: str, value: Any) -> None:
         """Raise a RequestError unless ``value`` has the shape and dtype of an observation."""
         spec = self.observation_spec
-        shape, wanted = np.shape(value), tuple(spec.shape)
-        if shape != wanted:
+        shape, expected = np.shape(value), tuple(spec.shape)
+        if shape != expected:
             hint = ""
-            if shape[1:] == wanted:
+            if shape[1:] == expected:
                 hint = ": jax.vmap(policy) takes a batch"
-            elif len(wanted) == 3 and shape == (*wanted[1:], wanted[0]):
+            elif len(expected) == 3 and shape == (*expected[1:], expected[0]):
                 hint = f": images are planar here, so move the channels first, np.moveaxis({name}, -1, 0)"
-            elif len(wanted) == 3 and name == "goal" and shape == (wanted[0] // self.env.frame_stack, *wanted[1:]):
+            elif len(expected) == 3 and name == "goal" and shape == (expected[0] // self.env.frame_stack, *expected[1:]):
                 hint = f": repeat the goal's image {self.env.frame_stack} times, as policy.env.as_goal does"
-            raise RequestError(f"{self.env_name}: {name} must have the shape {wanted}, not {shape}{hint}")
+            raise RequestError(f"{self.env_name}: {name} must have the shape {expected}, not {shape}{hint}")
         dtype = np.dtype(getattr(value, "dtype", None) or np.asarray(value).dtype)
         if spec.dtype == jnp.uint8:
             if dtype != np.uint8:
@@ -116,7 +116,8 @@ def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: Choice
         run_dir: The run folder, a folder of `jaxrl-vis push`, or the name of a policy that comes with the package.
         seed: Seed, for a run with several; None for the first.
         checkpoint: Iteration of a checkpoint, ``best`` for the best one by ``best_by``, or None for the newest valid one.
-        trust: Allow execution of the run's custom code (``module:Name``); not needed for runs that were trained here.
+        trust: Whether to allow execution of the run's custom code (``module:Name``); not needed for runs that were trained
+            here.
 
     Raises:
         RequestError: There is no run, no such seed or checkpoint, or no usable one; or its task is not available here, or is
@@ -144,7 +145,7 @@ def choose_seed(trainer: Trainer, run_dir: Path | str, seed: int | None) -> int:
 
 
 def make_policy(trainer: Trainer, restored: Restored, seed: int) -> Policy:
-    """Make the policy of one seed.
+    """Build the policy of one seed, and enable JAX's compilation cache.
 
     Args:
         trainer: From `restored_run.open_run`.

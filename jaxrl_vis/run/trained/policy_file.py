@@ -96,7 +96,7 @@ def _source(folder: Path, about: dict[str, Any]) -> Source:
 
 
 def read(folder: Path, trainer: Trainer) -> tuple[TrainState, Source]:
-    """Read a policy as a learner of one seed whose agent consists of the policy's parameters.
+    """Read a policy and its origin; the policy as a learner of one seed whose agent consists of the policy's parameters.
 
     Args:
         folder: Folder written by `write`.
@@ -106,12 +106,12 @@ def read(folder: Path, trainer: Trainer) -> tuple[TrainState, Source]:
         RequestError: The file is damaged, or belongs to another configuration.
     """
     shapes = trainer.shapes.train
-    wanted = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), shapes.agent)
+    expected = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), shapes.agent)
 
     same: dict[str, str] = {}
 
     def declare(about: dict[str, Any]) -> tuple[Source, dict[str, Any]]:
-        named = _name_parameters(wanted)
+        named = _name_parameters(expected)
         aliases = about.pop(_SAME, {})
         if not isinstance(aliases, dict) or not all(isinstance(other, str) for other in aliases.values()):
             raise ValueError(_SAME)
@@ -122,9 +122,9 @@ def read(folder: Path, trainer: Trainer) -> tuple[TrainState, Source]:
 
     nested, source, _ = read_parameters(folder / FILE_NAME, _WRITER, declare)
     read_leaves = _name_parameters(nested)
-    leaves = [read_leaves[same.get(name, name)].astype(leaf.dtype)[None] for name, leaf in _name_parameters(wanted).items()]
+    leaves = [read_leaves[same.get(name, name)].astype(leaf.dtype)[None] for name, leaf in _name_parameters(expected).items()]
     nothing_seen = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    return nothing_seen.replace(agent=jax.tree.unflatten(jax.tree.structure(wanted), leaves)), source
+    return nothing_seen.replace(agent=jax.tree.unflatten(jax.tree.structure(expected), leaves)), source
 
 
 def check_source(source: Source, seed: int | None = None, checkpoint: int | str | None = None) -> None:

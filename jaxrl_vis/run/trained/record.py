@@ -31,7 +31,7 @@ def record_run(run_dir: Path | str, episodes: int = 50, seed: int = 0, trust: bo
     if len(spec.shape) == 3 and spec.shape[0] // env.frame_stack not in (1, 3, 4):
         raise RequestError(f"{env.name} shows images of {spec.shape[0]} channels: only depth, colour and both can be recorded")
     played = programs.record(restored.train, jax.random.key(seed), episodes)
-    first = jax.tree.map(lambda *parts: np.concatenate([np.asarray(part[0]) for part in parts])[:episodes], *played)
+    first = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(part[0]) for part in leaves])[:episodes], *played)
     recorded, outcome = first
     depth_range = getattr(getattr(env, "config", None), "depth_range", None)
     about = {

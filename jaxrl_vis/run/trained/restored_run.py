@@ -28,7 +28,7 @@ def open_run(run_dir: Path | str, cache_programs: bool = False, trust: bool = Fa
     Args:
         run_dir: The run folder.
         cache_programs: As in `make_trainer`; programs traced by the training are reused.
-        trust: Allow execution of the run's custom code (`jaxrl_vis.run.trust`).
+        trust: Whether to allow execution of the run's custom code (`jaxrl_vis.run.trust`).
         **changes: New values of fields of `Config`.
 
     Raises:
@@ -54,7 +54,7 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: Choice = None) -> Re
     Args:
         trainer: From `open_run`.
         run_dir: The run folder.
-        checkpoint: The checkpoint.
+        checkpoint: See `Choice`.
 
     Raises:
         RequestError: There is no such checkpoint, or no usable one.
@@ -105,7 +105,7 @@ def evaluate_run(
         run_dir: The run folder.
         episodes: Number of episodes; None for that of the training.
         cache_programs, trust: As in `open_run`.
-        checkpoint: The checkpoint.
+        checkpoint: See `Choice`.
 
     Returns:
         ``eval/success``, ``eval/goal_distance`` etc.: one number per seed.
@@ -115,7 +115,7 @@ def evaluate_run(
     """
     trainer = open_run(run_dir, cache_programs, trust, **({} if episodes is None else {"eval_episodes": episodes}))
     restored = load(trainer, run_dir, checkpoint)
-    check_compiled(trainer.programs.of_evaluation(), is_allocated=True)
+    check_compiled(trainer.programs.evaluation_programs(), is_allocated=True)
     values = jax.device_get(trainer.evaluate(restored.train))
     return {name: [float(number) for number in value] for name, value in values.items()}
 
@@ -135,10 +135,10 @@ def play_run(
         run_dir: The run folder.
         out: .gif, .mp4 (needs imageio-ffmpeg, the extra ``video``), .html or .png.
         episodes: Number of episodes.
-        three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; also for state
-            variants.
+        three_dimensional: Whether to write an .html page for brax's viewer (needs brax) instead of the robot's images; also for
+            state variants.
         cache_programs, trust: As in `open_run`.
-        checkpoint: The checkpoint.
+        checkpoint: See `Choice`.
 
     Raises:
         RequestError: There is no run, no usable checkpoint, no image to show, or ``out`` cannot be written.

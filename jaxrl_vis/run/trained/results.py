@@ -6,7 +6,7 @@ from typing import Any
 from jaxrl_vis.config import Config
 from jaxrl_vis.report import videos
 from jaxrl_vis.run.compiled.programs import Programs
-from jaxrl_vis.run.loggers.console import show_seconds
+from jaxrl_vis.run.loggers.console import format_seconds
 from jaxrl_vis.run.loggers.group import Loggers
 from jaxrl_vis.run.storage.folder import RunFolder
 from jaxrl_vis.run.storage.progress import Progress
@@ -51,8 +51,8 @@ class Results:
         success = ", ".join(f"seed {row['seed']}: {row['eval/success']:.3f}" for row in rows)
         written = [file.name for file in (self._folder.curve, self._folder.video) if file.exists()]
         progress = progress_now()
-        compiling = show_seconds(progress.compile_s)
-        self._echo(f"success at the end: {success}; {show_seconds(progress.wall_s)}, of which {compiling} compiling")
+        compiling = format_seconds(progress.compile_s)
+        self._echo(f"success at the end: {success}; {format_seconds(progress.wall_s)}, of which {compiling} compiling")
         self._echo(f"see {', '.join([*written, self._folder.metrics.name])} in {self._folder.path}")
 
     def draw_curve(self, done: int) -> None:

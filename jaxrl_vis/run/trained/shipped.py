@@ -35,6 +35,6 @@ def check(run: Path | str) -> None:
         raise RequestError(f"there is neither a run folder nor a policy called {str(run)[:60]!r}{suggestion}")
 
 
-def workplace(folder: Path) -> Path:
+def output_folder(folder: Path) -> Path:
     """Return the output folder of a run: the run folder or, for a policy of the package, its name in the current folder."""
     return Path(folder.name) if folder.parent == FOLDER else folder

@@ -14,8 +14,8 @@ from jaxrl_vis.run.goodput import read_processes
 from jaxrl_vis.run.storage.checkpoint import BEST, DAMAGED, FOREIGN, FULL, LIGHT, RECENT
 from jaxrl_vis.run.storage.folder import EXPORT_FOLDER, LOGGER_FOLDERS, WANDB_STATE, RunFolder
 from jaxrl_vis.run.storage.lock import FILE_NAME as LOCK_NAME
-from jaxrl_vis.run.storage.metrics import RUN_ID, Place
-from jaxrl_vis.run.storage.recent import names_of_others
+from jaxrl_vis.run.storage.metrics import RUN_ID, RowKeys
+from jaxrl_vis.run.storage.recent import foreign_names
 
 LOST = "resume/replay_lost_at"
 """Key of a row: the last iteration at which the run resumed without its replay."""
@@ -39,7 +39,7 @@ class Findings:
 
 
 @dataclasses.dataclass(frozen=True)
-class Expected:
+class RowConditions:
     """Conditions that every row of a run must meet.
 
     Attributes:
@@ -72,18 +72,18 @@ def _read_line(line: bytes) -> dict[str, Any] | str:
         row = json.loads(line.decode("utf-8"))
     except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
         return "is damaged"
-    if not isinstance(row, dict) or not all(is_count(row.get(name)) for name in Place._fields):
-        return f"is no row: {', '.join(Place._fields)} must be numbers"
+    if not isinstance(row, dict) or not all(is_count(row.get(name)) for name in RowKeys._fields):
+        return f"is no row: {', '.join(RowKeys._fields)} must be numbers"
     return row
 
 
-def read_file(path: Path, expected: Expected, is_written: bool, findings: Findings) -> list[dict[str, Any]]:
+def read_file(path: Path, expected: RowConditions, is_written: bool, findings: Findings) -> list[dict[str, Any]]:
     """Read the rows of a run from a metrics file, in the order of the file; faults of other lines are reported.
 
     Args:
         path: metrics.jsonl.
         expected: Conditions on every row.
-        is_written: Another process may be writing, so that the last line may be incomplete.
+        is_written: Whether another process may be writing, so that the last line may be incomplete.
         findings: Findings, to which this adds.
     """
     *lines, rest = path.read_bytes().split(b"\n") if path.exists() else [b""]
@@ -101,7 +101,7 @@ def read_file(path: Path, expected: Expected, is_written: bool, findings: Findin
     return rows
 
 
-def _fault(row: Mapping[str, Any], expected: Expected) -> str:
+def _fault(row: Mapping[str, Any], expected: RowConditions) -> str:
     """Describe a contradiction between a row and the configuration; empty if there is none."""
     iteration = row["iteration"]
     if row.get(RUN_ID) != expected.run_id:
@@ -119,12 +119,12 @@ def _fault(row: Mapping[str, Any], expected: Expected) -> str:
     return ""
 
 
-def _check_order(name: str, rows: Sequence[Mapping[str, Any]], expected: Expected, findings: Findings) -> None:
-    places = [(row["iteration"], row["seed"]) for row in rows]
-    twice = sorted(place for place, count in collections.Counter(places).items() if count > 1)
+def _check_order(name: str, rows: Sequence[Mapping[str, Any]], expected: RowConditions, findings: Findings) -> None:
+    keys = [(row["iteration"], row["seed"]) for row in rows]
+    twice = sorted(key for key, count in collections.Counter(keys).items() if count > 1)
     for iteration, seed in twice:
         findings.problems.append(f"{name}: iteration {iteration}, seed {seed} occurs more than once")
-    unique = list(dict.fromkeys(places))
+    unique = list(dict.fromkeys(keys))
     if unique != sorted(unique):
         first = next(after for before, after in zip(unique, unique[1:], strict=False) if after < before)
         findings.problems.append(f"{name}: iteration {first[0]}, seed {first[1]} is out of order")
@@ -135,7 +135,7 @@ def _check_order(name: str, rows: Sequence[Mapping[str, Any]], expected: Expecte
 
 def missing_rows(
     rows: Sequence[Mapping[str, Any]],
-    expected: Expected,
+    expected: RowConditions,
     last_written: int,
     total: int,
     without: Collection[int],
@@ -149,7 +149,7 @@ def missing_rows(
         last_written: Last iteration whose rows were written, according to checkpoints, or 0.
         total: Iterations of the run; the last one is always evaluated.
         without: Scheduled iterations without an evaluation.
-        is_written: Another process may be writing rows of the last iteration.
+        is_written: Whether another process may be writing rows of the last iteration.
     """
     seeds_at: dict[int, set[int]] = {}
     for row in rows:
@@ -204,8 +204,8 @@ def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findin
 
     Args:
         folder: The run folder.
-        is_finished: The run is complete.
-        shows_images: A complete run has a video.
+        is_finished: Whether the run is complete.
+        shows_images: Whether the task has images, so that a complete run has a video.
         findings: Findings, to which this adds.
     """
     files = (folder.config, folder.metrics, folder.processes, folder.curve, folder.video)
@@ -221,7 +221,7 @@ def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findin
             half = sorted(name for name in names if ".orbax-checkpoint-tmp" in name)
             findings.notes += [f"checkpoints/{tier}/{name} is half-written" for name in half]
             foreign += [f"checkpoints/{tier}/{name}" for name in names - set(half)]
-        foreign += [f"checkpoints/{RECENT}/{name}" for name in names_of_others(folder.checkpoints / RECENT)]
+        foreign += [f"checkpoints/{RECENT}/{name}" for name in foreign_names(folder.checkpoints / RECENT)]
         for name, reason in _ASIDE.items():
             if (folder.checkpoints / name).is_dir():
                 aside = sorted(entry.name for entry in (folder.checkpoints / name).iterdir())

@@ -14,7 +14,7 @@ from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, RECENT
 from jaxrl_vis.run.storage.metrics import RUN_ID, PerSeed
 from jaxrl_vis.run.storage.progress import Progress
 from jaxrl_vis.run.storage.restoring import state_without_learner
-from jaxrl_vis.run.verifying.inspection import Expected, Findings, format_list
+from jaxrl_vis.run.verifying.inspection import Findings, RowConditions, format_list
 from jaxrl_vis.types import LoopState
 
 NOT_REPEATED = (RUN_ID, "time/", "resume/")
@@ -30,7 +30,7 @@ class Verification(Findings):
     """Findings about a run folder, and results of repeating its iterations.
 
     Attributes:
-        rows, numbers: Rows and numbers that were repeated, equal or not.
+        rows, numbers: Counts of the rows that were repeated and of their numbers, equal or not.
         checkpoints: Names of the checkpoints that were compared with a repetition.
         differences: Lines about rows and checkpoints that differ from the repetition; also among the problems.
         largest: The largest relative difference of a number.
@@ -53,7 +53,7 @@ class Verification(Findings):
 
 
 class Repeater:
-    """Repeats parts of one run.
+    """Repetition of iterations of one run, and comparison with its rows and checkpoints.
 
     Args:
         programs: Programs of the run.
@@ -71,7 +71,7 @@ class Repeater:
     def __init__(
         self,
         programs: Programs,
-        expected: Expected,
+        expected: RowConditions,
         rows: Sequence[Row],
         manifests: Mapping[tuple[str, int], dict[str, Any]],
         report: Verification,
@@ -117,17 +117,21 @@ class Repeater:
 
     def _compare(self, name: str, iteration: int, loop: LoopState, history: Mapping[int, PerSeed]) -> None:
         """Compare the rows of an iteration with the repetition."""
-        there = [row for row in self._rows if row["iteration"] == iteration]
+        rows = [row for row in self._rows if row["iteration"] == iteration]
         outcome, _ = self._programs.evaluate(loop.train)
         evaluated = self._programs.pending(outcome).read_per_seed(len(self._expected.seeds))
         best: list[tuple[int, str, Any, Any]] | None = None
-        for begin in self._begins(iteration, history):
-            made = self._repeated_rows(iteration, evaluated, [history[number] for number in range(begin + 1, iteration + 1)])
+        for begin in self._mean_starts(iteration, history):
+            repeated = self._repeated_rows(
+                iteration, evaluated, [history[number] for number in range(begin + 1, iteration + 1)]
+            )
             differences = [
-                (row["seed"], key, value, again) for row in there for key, value, again in _differences(row, made[row["seed"]])
+                (row["seed"], key, value, again)
+                for row in rows
+                for key, value, again in _differences(row, repeated[row["seed"]])
             ]
             if best is None:
-                best, numbers = differences, sum(len(_comparable_values(row)) for row in there)
+                best, numbers = differences, sum(len(_comparable_values(row)) for row in rows)
             if not differences:
                 if best:
                     self.without_evaluation.update(range(begin + 1, iteration))
@@ -139,16 +143,18 @@ class Repeater:
         assert best is not None
         if iteration not in self.repeated:
             self.repeated.add(iteration)
-            self._report.rows += len(there)
+            self._report.rows += len(rows)
             self._report.numbers += numbers
         if best:
             self._report_differences(name, iteration, best)
         else:
-            seeds = "1 seed" if len(there) == 1 else f"{len(there)} seeds"
+            seeds = "1 seed" if len(rows) == 1 else f"{len(rows)} seeds"
             self._echo(f"  iteration {iteration}: {numbers} numbers of {seeds}, all equal")
 
     def _report_differences(self, name: str, iteration: int, differences: Sequence[tuple[int, str, Any, Any]]) -> None:
-        self._report.largest = max([self._report.largest, *(_relative(value, again) for _, _, value, again in differences)])
+        self._report.largest = max(
+            [self._report.largest, *(_relative_difference(value, again) for _, _, value, again in differences)]
+        )
         shown = format_list(
             f"seed {seed} {key} is {value} in the file, {again} here" for seed, key, value, again in differences
         )
@@ -157,7 +163,7 @@ class Repeater:
             hint = " (or eval_episodes had another value then)"
         self._note_difference(f"iteration {iteration}, from {name}: {shown}{hint}")
 
-    def _begins(self, iteration: int, history: Mapping[int, PerSeed]) -> list[int]:
+    def _mean_starts(self, iteration: int, history: Mapping[int, PerSeed]) -> list[int]:
         """List candidates for the iteration after which the means of a row begin, the one implied by eval_interval first."""
         interval, earliest = self._expected.eval_interval, min(history, default=iteration + 1) - 1
         scheduled = max((iteration - 1) // interval * interval, earliest)
@@ -238,16 +244,16 @@ def _comparable_values(row: Mapping[str, Any]) -> Row:
     return {name: value for name, value in row.items() if not name.startswith(NOT_REPEATED)}
 
 
-def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the names of values that differ as JSON text, with both values."""
+def _differences(row: Mapping[str, Any], repeated: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the name, the value of ``row`` and that of ``repeated``, for values that differ as JSON text."""
     compared = _comparable_values(row)
-    for name in dict.fromkeys([*compared, *made]):
-        value, again = compared.get(name, "nothing"), made.get(name, "nothing")
+    for name in dict.fromkeys([*compared, *repeated]):
+        value, again = compared.get(name, "nothing"), repeated.get(name, "nothing")
         if json.dumps(value) != json.dumps(again):
             yield name, value, again
 
 
-def _relative(value: Any, repeated: Any) -> float:
+def _relative_difference(value: Any, repeated: Any) -> float:
     """Return the difference of two numbers relative to the larger one; infinite if either value is not numeric."""
     if not (isinstance(value, int | float) and isinstance(repeated, int | float)):
         return math.inf

@@ -33,7 +33,7 @@ from jaxrl_vis.run.trainer import Trainer, make_trainer
 from jaxrl_vis.run.trust import check as check_trusted
 from jaxrl_vis.run.verifying.inspection import (
     LOST,
-    Expected,
+    RowConditions,
     check_files,
     check_record,
     format_list,
@@ -62,7 +62,7 @@ def verify_run(
         iterations: Number of iterations to repeat from each start; None: up to the second evaluation.
         cache_programs: As in `jaxrl_vis.run.trainer.make_trainer`.
         echo: Called with a line about each step.
-        trust: Allow the run's own code, if its task is module:Name and was trained by another user.
+        trust: Whether to allow execution of the run's custom code (`jaxrl_vis.run.trust`).
 
     Raises:
         RequestError: There is no run, or it is not trusted, cannot be created any more, or needs more memory than is available.
@@ -93,7 +93,10 @@ def verify(
     report: Verification,
     echo: Callable[[str], None],
 ) -> Verification:
-    """Verify a run with an existing trainer of its configuration and the contents of its config.json."""
+    """Verify a run with an existing trainer of its configuration and the contents of its config.json.
+
+    Findings are added to ``report``, which is returned; other arguments as for `verify_run`.
+    """
     return _Verifier(trainer, RunFolder(path), record, report, echo).verify(iterations)
 
 
@@ -104,7 +107,7 @@ class _Verifier:
         self._programs, self._config, self._folder = trainer.programs, trainer.config, folder
         self._record, self._report, self._echo = record, report, echo
         program = trainer.program
-        self._expected = Expected(
+        self._expected = RowConditions(
             seeds=list(trainer.seeds),
             updates=program.updates_per_iteration,
             env_steps=program.steps_per_iteration,
@@ -159,8 +162,8 @@ class _Verifier:
         libraries = ", ".join(f"{name} {versions[name]}" for name in ("jax", "jaxlib", "python") if name in versions)
         where = f"{device.get('count')} {device.get('kind')}, {device.get('cpu_count')} cores"
         self._echo(f"made by revision {recorded['revision'] or 'unknown'}, {libraries or 'unknown versions'}, on {where}")
-        other = [name for name in recorded if recorded[name] != current.get(name)]
-        report.elsewhere += [f"{name} {recorded[name]} then, {current.get(name)} now" for name in other]
+        changed = [name for name in recorded if recorded[name] != current.get(name)]
+        report.elsewhere += [f"{name} {recorded[name]} then, {current.get(name)} now" for name in changed]
         if recorded["revision"] is None:
             report.elsewhere.append("config.json names no revision")
         elif str(recorded["revision"]).endswith("-dirty"):
@@ -233,7 +236,7 @@ class _Verifier:
         return False
 
     def _check_presence(self, is_written: bool) -> None:
-        """Report a lack of checkpoints although the run is far enough to have one."""
+        """Report a lack of checkpoints if the run is far enough to have one, unless another process is writing."""
         last = max((row["iteration"] for row in self._rows), default=0)
         interval = self._config.run.checkpoint_interval
         # An evaluation's rows are written before the checkpoint of the same iteration.

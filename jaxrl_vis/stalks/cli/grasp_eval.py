@@ -80,7 +80,11 @@ def _check(options: Eval) -> None:
 
 
 def evaluate(options: Eval) -> int:
-    """Evaluate the runs, print their scores, and return the exit status."""
+    """Evaluate the runs, print their scores, and return the exit status.
+
+    Raises:
+        RequestError: An option, the weights or the policy is invalid, a package is missing, or no device works.
+    """
     _check(options)
     if options.policy is not None:
         check_run(options.policy)
@@ -112,15 +116,15 @@ def evaluate(options: Eval) -> int:
     for figure, value in records.summarise(perceived).items():
         print(f"  {figure:20} {f'{value:.4f}' if isinstance(value, float) else value}")
     if options.reach:
-        _reach(options, table, numbers)
+        _reach_all(options, table, numbers)
     return 0
 
 
-def _reach(options: Eval, table: RecordFile, numbers: range) -> None:
-    """Run the simulated arm for each loop and wind, and print the scores of its grasps."""
+def _reach_all(options: Eval, table: RecordFile, numbers: range) -> None:
+    """Run the simulated arm for each loop and wind, add its reaches to ``table``, and print the scores of its grasps."""
     from jaxrl_vis.stalks.grasping.evaluation import records
 
-    policy, name = _policy(options)
+    policy, name = _load_policy(options)
     loops, winds = options.loops, options.wind or (0.0,)
     kinds = [records.Reaches(loop, wind, "policy" in loops, policy, name) for loop in loops for wind in winds]
     scores = {}
@@ -139,11 +143,11 @@ def _reach(options: Eval, table: RecordFile, numbers: range) -> None:
             proportions = (score.with_room, score.crowded, score.of_reachable, score.touches)
             print(
                 f"{kind:{width}}  "
-                + "  ".join(f"{proportion.value:9.1%}" if proportion.of else f"{'none':>9}" for proportion in proportions)
+                + "  ".join(f"{proportion.value:9.1%}" if proportion.total else f"{'none':>9}" for proportion in proportions)
             )
 
 
-def _policy(options: Eval) -> "tuple[Policy | None, str]":
+def _load_policy(options: Eval) -> "tuple[Policy | None, str]":
     """Load the policy for the loop ``policy``, and return it with a name that identifies it; None and "" without one."""
     if options.policy is None:
         return None, ""
@@ -158,10 +162,10 @@ def _policy(options: Eval) -> "tuple[Policy | None, str]":
 def _print_run(number: int, record: Record) -> None:
     """Print one line with the scores of a run."""
     from jaxrl_vis.stalks.grasping.evaluation import records
-    from jaxrl_vis.stalks.grasping.evaluation.scoring import summary
+    from jaxrl_vis.stalks.grasping.evaluation.scoring import summarise_scores
 
     score = records.read_score(record)
-    one = summary([score])
+    one = summarise_scores([score])
     print(
         f"run {number}: {len(score.errors)} of {score.true} stalks, {score.detected - len(score.errors)} false, "
         f"grasp points {one['point_median_mm']:.1f} mm, stitches {one['stitch_median_mm']:.1f} mm"

@@ -73,7 +73,11 @@ class GraspsFigure(_FigureOptions):
 
 
 def draw_perception(options: PerceptionFigure) -> int:
-    """Draw figure 4.4, and return the exit status."""
+    """Draw figure 4.4, and return the exit status.
+
+    Raises:
+        RequestError: An option or the file of weights is invalid, a package is missing, or no device works.
+    """
     out = options.check()
     from jaxrl_vis.stalks.grasping.masks.loading import load_painter, resolve_weights
     from jaxrl_vis.stalks.grasping.report.perception_figure import draw_figure
@@ -87,7 +91,11 @@ def draw_perception(options: PerceptionFigure) -> int:
 
 
 def draw_path(options: PathFigure) -> int:
-    """Draw figure 4.5, optionally with a video, and return the exit status."""
+    """Draw figure 4.5, optionally with a video, and return the exit status.
+
+    Raises:
+        RequestError: An option is invalid, a package is missing, or no device works.
+    """
     check_wind(options.wind)
     if options.video is not None:
         from jaxrl_vis.report.videos import check_output
@@ -108,7 +116,11 @@ def draw_path(options: PathFigure) -> int:
 
 
 def draw_grasps(options: GraspsFigure) -> int:
-    """Draw figure 4.6 from an evaluation, which is run first if necessary, and return the exit status."""
+    """Draw figure 4.6 from an evaluation, which is run first if none is given, and return the exit status.
+
+    Raises:
+        RequestError: An option or the evaluation is invalid, a package is missing, or no device works.
+    """
     check_wind(options.wind)
     out = options.check()
     from jaxrl_vis.stalks.grasping.report import reach_figures

@@ -34,7 +34,12 @@ class Run(CameraOptions):
 
 
 def run(options: Run) -> int:
-    """Process the runs, write tables and overlays, and return the exit status: 3 if pairs were skipped."""
+    """Process the runs, write tables and overlays, and return the exit status: 3 if pairs were skipped, 0 otherwise.
+
+    Raises:
+        RequestError: An option, a folder, a calibration or the weights are invalid, a package is missing, or no device works.
+        StorageError: The results cannot be written.
+    """
     check_speed(options.speed)
     if not 0.05 <= options.height <= 3.0:
         raise RequestError(f"--height must be from 0.05 to 3 m, not {options.height:g}")
@@ -51,7 +56,7 @@ def run(options: Run) -> int:
             raise RequestError(f"{name} has no calibration, without which there are no metres: name one with --calibration")
     check_devices()
     enable_compilation_cache()
-    from jaxrl_vis.stalks.grasping.evaluation.attempts import from_any_stop
+    from jaxrl_vis.stalks.grasping.evaluation.attempts import reachable_from_any_stop
     from jaxrl_vis.stalks.grasping.perception.cloud import Mount
     from jaxrl_vis.stalks.grasping.perception.perceive import DEFAULT_VARIANT, THESIS_VARIANT
     from jaxrl_vis.stalks.grasping.pipeline import Request, run
@@ -71,7 +76,7 @@ def run(options: Run) -> int:
 
     known = {name: calibration for name, calibration in calibrations.items() if calibration is not None}
     variant, mount = THESIS_VARIANT if options.thesis else DEFAULT_VARIANT, Mount(options.height, options.pitch)
-    request = Request(options.out, variant, name, known, mount, options.speed, from_any_stop)
+    request = Request(options.out, variant, name, known, mount, options.speed, reachable_from_any_stop)
 
     def echo(row) -> None:
         print(f"{row['run']}: {row['grasp_points']} grasp points in {row['pairs']} pairs: {row['flag']}", flush=True)

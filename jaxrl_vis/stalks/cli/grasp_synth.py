@@ -18,7 +18,11 @@ class Synth(SynthOptions):
 
 
 def synth(options: Synth) -> int:
-    """Write the runs, and return the exit status."""
+    """Write the runs, and return the exit status.
+
+    Raises:
+        RequestError: An option is invalid, a package is missing, no device works, or the folder cannot be written to.
+    """
     check_counts(runs=options.runs)
     options.check()
     check_extra("grasping")

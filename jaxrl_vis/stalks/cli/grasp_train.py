@@ -32,7 +32,11 @@ class Train(TrainingOptions):
 
 
 def train(options: Train) -> int:
-    """Train the network, write its weights, and return the exit status."""
+    """Train the network, write its weights, and return the exit status.
+
+    Raises:
+        RequestError: An option is invalid, a package is missing, no device works, or OUT cannot be written to.
+    """
     check_counts(crop=options.crop)
     options.check()
     if options.crop % 64:

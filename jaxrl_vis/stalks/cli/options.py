@@ -238,19 +238,19 @@ class CameraOptions:
         return None if self.left is None or self.right is None else Patterns(self.left, self.right)
 
     def find_plots(self, folder: Path, out: Path) -> list[PlotFolder]:
-        """Return the plots in a folder or a recording, which is extracted to the folder ``recording`` in ``out``.
+        """Find the plots in a folder, or in a recording, whose images are extracted to the folder ``recording`` in ``out``.
 
         Raises:
             RequestError: There are none, they are ambiguous, or the recording cannot be read.
         """
         from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
-        from jaxrl_vis.stalks.phenotyping.io.recording import Topics, is_recording, take_apart
+        from jaxrl_vis.stalks.phenotyping.io.recording import Topics, extract_recording, is_recording
 
         patterns = self.patterns()
         if not is_recording(folder):
             return find_plots(folder, patterns)
         topics = None if patterns is None else Topics(patterns.left, patterns.right)
-        return find_plots(take_apart(folder, out / "recording", topics))
+        return find_plots(extract_recording(folder, out / "recording", topics))
 
     def read_calibration(self, plot: PlotFolder) -> Calibration | None:
         """Read the calibration of one folder of pairs; return None if there is none.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from jaxrl_vis.cli.checks import check_counts
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
-from jaxrl_vis.host.worker_pool import Record, finite, share_accelerator
+from jaxrl_vis.host.worker_pool import Record, replace_non_finite, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.stalks.cli.options import EvaluationOptions, check_extra, check_masks
 
@@ -37,7 +37,11 @@ class Eval(EvaluationOptions):
 
 
 def evaluate(options: Eval) -> int:
-    """Evaluate the plots, print their scores, and return the exit status."""
+    """Evaluate the plots, print their scores, and return the exit status.
+
+    Raises:
+        RequestError: An option or the file of weights is invalid, a package is missing, or no device works.
+    """
     check_counts(plots=options.plots)
     options.check()
     if not 0.0 <= options.min_score <= 1.0:
@@ -60,7 +64,7 @@ def evaluate(options: Eval) -> int:
         weights = resolve_weights(options.weights)
         load_finder(weights, options.min_score)  # reports what is wrong with the weights
         name = detector_name(weights)
-    figures = _evaluate(options, _factors(options) if options.each_factor else {"": family}, weights, name)
+    figures = _evaluate(options, _read_factors(options) if options.each_factor else {"": family}, weights, name)
     if options.each_factor:
         _write_table(options, name, figures)
         return 0
@@ -70,7 +74,7 @@ def evaluate(options: Eval) -> int:
     return 0
 
 
-def _factors(options: Eval) -> "dict[str, Family]":
+def _read_factors(options: Eval) -> "dict[str, Family]":
     """Return the families of ``--each-factor``: unshifted (``none``), with each factor shifted alone, and with ``all``."""
     from jaxrl_vis_envs.plants import SHIFTS
 
@@ -102,11 +106,11 @@ def _evaluate(options: Eval, families: "Mapping[str, Family]", weights: Path | N
         )
 
     seeds = range(options.seed, options.seed + options.plots)
-    return records.evaluate_tasks(tasks, seeds, {factor: _path(options.json, factor) for factor in tasks}, started, done)
+    return records.evaluate_tasks(tasks, seeds, {factor: _factor_file(options.json, factor) for factor in tasks}, started, done)
 
 
-def _path(path: Path | None, factor: str) -> Path | None:
-    """Return the file of one factor, beside that of the table; None without a file."""
+def _factor_file(path: Path | None, factor: str) -> Path | None:
+    """Return the file of one factor, beside the table's ``path``; ``path`` itself if it is None or the factor is ""."""
     return path.with_name(f"{path.stem}-{factor}.json") if path and factor else path
 
 
@@ -114,11 +118,11 @@ _COLUMNS = ("count_r2", "count_mae", "count_bias", "width_mae_mm", "width_bias_m
 
 
 def _write_table(options: Eval, name: str, figures: Mapping[str, dict[str, Any]]) -> None:
-    """Print a Markdown table with one row per shifted factor, and write it as JSON if a file is given."""
+    """Print a Markdown table with one row per key of ``figures``, and write all figures to ``--json``, if given."""
     from jaxrl_vis.host.files import write_atomically
 
     if options.json is not None:
-        about = {"synthetic": True, "finder": name, "method": options.method, "factors": finite(figures)}
+        about = {"synthetic": True, "finder": name, "method": options.method, "factors": replace_non_finite(figures)}
         write_atomically(options.json, json.dumps(about, indent=2) + "\n")
     print(f"\nsynthetic plots, {options.plots} each, {name}, {options.method}\n")
     print("| shifted | " + " | ".join(_COLUMNS) + " |")

@@ -33,7 +33,11 @@ class Figure:
 
 
 def draw(options: Figure) -> int:
-    """Draw one figure, and return the exit status."""
+    """Draw one figure, or write the table, from an evaluation, which is run first if none is given; return the exit status.
+
+    Raises:
+        RequestError: An option or the evaluation is invalid, a package is missing, or no device works.
+    """
     is_table = options.figure == "table3.1"
     suffixes = (".md",) if is_table else FIGURE_SUFFIXES
     out = options.out or Path("table_3.1.md" if is_table else f"figure_{options.figure}.png")

@@ -27,7 +27,12 @@ class Label:
 
 
 def label(options: Label) -> int:
-    """Write the proposals, and return the exit status: 3 if images were skipped."""
+    """Write the proposals, and return the exit status: 3 if images were skipped, 0 otherwise.
+
+    Raises:
+        RequestError: An option, the folder or the file of weights is invalid, there are annotations in COCO format already, a
+            package is missing, or no device works.
+    """
     if not 0.0 <= options.min_score <= 1.0:
         raise RequestError(f"--min-score must be from 0 to 1, not {options.min_score:g}")
     check_extra("phenotyping")
@@ -52,14 +57,14 @@ def label(options: Label) -> int:
     check_devices()
     enable_compilation_cache()
     from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder, resolve_weights
-    from jaxrl_vis.stalks.phenotyping.io.images import read_image, rgb8
+    from jaxrl_vis.stalks.phenotyping.io.images import read_image, to_rgb8
 
     weights = resolve_weights(options.weights)
     find = load_finder(weights, options.min_score)
     labelled, skipped = [], 0
     for index, path in enumerate(paths, start=1):
         try:
-            image = rgb8(read_image(path))
+            image = to_rgb8(read_image(path))
         except OSError as error:
             print(f"skipped {error}", flush=True)
             skipped += 1

@@ -52,7 +52,13 @@ class Run(CameraOptions):
 
 
 def run(options: Run) -> int:
-    """Process the plots, write tables, the page and overlays, and return the exit status: 3 if pairs were skipped."""
+    """Process the plots, write tables, the page and overlays, and return the exit status: 3 if pairs were skipped, else 0.
+
+    Raises:
+        RequestError: An option, a folder, a calibration, the field plan or the weights are invalid, a package is missing, or no
+            device works.
+        StorageError: The results cannot be written.
+    """
     if not 0.0 <= options.min_score <= 1.0:
         raise RequestError(f"--min-score must be from 0 to 1, not {options.min_score:g}")
     check_speed(options.speed)
@@ -64,9 +70,9 @@ def run(options: Run) -> int:
     check_writable(options.out, "--out", folder=True)
     from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE
     from jaxrl_vis.stalks.phenotyping.io.tables.field_plan import missing_plots, read_field_plan
-    from jaxrl_vis.stalks.phenotyping.report.exchange import with_terms, write_exchange
+    from jaxrl_vis.stalks.phenotyping.report.exchange import replace_terms, write_exchange
 
-    traits = with_terms(options.term)
+    traits = replace_terms(options.term)
     plots = options.find_plots(options.folder or SAMPLE, options.out)
     if options.folder is None:
         print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
@@ -79,7 +85,7 @@ def run(options: Run) -> int:
         share_accelerator()
     check_devices()
     enable_compilation_cache()
-    from jaxrl_vis.stalks.phenotyping.measure.lens import TRIED
+    from jaxrl_vis.stalks.phenotyping.measure.lens import VALIDATED
     from jaxrl_vis.stalks.phenotyping.pipeline import Request, run
 
     gate = None
@@ -99,7 +105,7 @@ def run(options: Run) -> int:
             )
         find = functools.partial(find_stalks, weights, options.min_score)
 
-    tried = TRIED if options.masks == "network" else None
+    tried = VALIDATED if options.masks == "network" else None
     max_doubt = None if gate is None else gate.threshold
     request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale, tried, max_doubt)
     for plot in plots:

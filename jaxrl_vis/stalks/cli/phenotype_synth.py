@@ -26,7 +26,11 @@ class Synth(SynthOptions):
 
 
 def synth(options: Synth) -> int:
-    """Write the plots, and return the exit status."""
+    """Write the plots, and return the exit status.
+
+    Raises:
+        RequestError: An option is invalid, a package is missing, no device works, or the folder cannot be written to.
+    """
     check_counts(plots=options.plots)
     options.check()
     check_extra("phenotyping")

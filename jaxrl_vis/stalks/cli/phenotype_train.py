@@ -24,7 +24,12 @@ _FIRST_SEED = 100_000
 
 
 def train(options: DetectorTraining) -> int:
-    """Train the networks, write their weights, and return the exit status."""
+    """Train the networks, write their weights, and return the exit status.
+
+    Raises:
+        RequestError: An option, the annotations or the initial weights are invalid, a package is missing, no device works, or
+            OUT cannot be written to.
+    """
     check_counts(crops=options.crops)
     options.check()
     drawn = (options.family, options.shift, options.spec, options.frames, options.width)

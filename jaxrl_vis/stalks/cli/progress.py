@@ -9,13 +9,13 @@ from rich.progress import Task
 from jaxrl_vis.host.streams import safe
 from jaxrl_vis.run.loggers.bar import FittingProgress
 
-Done = Callable[[str, int, int], None]
+ProgressFunction = Callable[[str, int, int], None]
 """Progress callback, called with the name of a part, the number of units done, and the total number of units."""
 _SHORT_NAME = 20
 
 
 @contextlib.contextmanager
-def progress(unit: str) -> Iterator[Done]:
+def progress(unit: str) -> Iterator[ProgressFunction]:
     """Show the progress of a command on stdout, and yield the callback that updates it.
 
     Args:

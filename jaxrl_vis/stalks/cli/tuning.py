@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
     from jaxrl_vis.stalks.phenotyping.training.examples import Example
     from jaxrl_vis.stalks.phenotyping.training.photographs import Split
-    from jaxrl_vis.stalks.phenotyping.training.tuning import Tuned
+    from jaxrl_vis.stalks.phenotyping.training.tuning import TuningResult
 
 _STEPS = 1500
 _RATE, _RATE_FROM_RANDOM = 3e-4, 1e-3
@@ -47,11 +47,11 @@ def train_on_images(options: DetectorTraining, folder: Path) -> int:
     enable_compilation_cache()
     from jaxrl_vis import __version__
     from jaxrl_vis.stalks.phenotyping.detector.weights import write_weights
-    from jaxrl_vis.stalks.phenotyping.training.annotated import any_outlined
+    from jaxrl_vis.stalks.phenotyping.training.annotated import has_outlines
     from jaxrl_vis.stalks.phenotyping.training.tuning import Tuning, tune
 
     start, settings, origin = _start(options, folder, echo)
-    masks = any_outlined(folder, options.label)
+    masks = has_outlines(folder, options.label)
     if not masks:
         echo("masks stay as they are: no annotation has an outline, only boxes")
     examples = _read_examples(options, folder, settings, len(names["images"]), echo)
@@ -65,17 +65,17 @@ def train_on_images(options: DetectorTraining, folder: Path) -> int:
         seed=options.seed,
     )
 
-    def keep(params: Any, step: int) -> None:
+    def save_best(params: Any, step: int) -> None:
         about = {"version": __version__, "origin": f"annotated images{origin}", "steps": step, "seed": options.seed}
         write_weights(options.out, params, settings, about)
 
-    tuned = tune(examples, parts, settings, tuning, start, echo, keep)
-    keep(tuned.params, tuned.steps)
-    echo(f"the end: {tuned.why}; weights are those of update {tuned.steps}")
+    tuned = tune(examples, parts, settings, tuning, start, echo, save_best)
+    save_best(tuned.params, tuned.best_step)
+    echo(f"the end: {tuned.stop_reason}; weights are those of update {tuned.best_step}")
     if parts.test:
         _report(page, examples, parts, tuned, settings, start, masks, echo)
     size = options.out.stat().st_size / 1e6
-    echo(f"{options.out}: {tuned.made} updates on annotated images{origin}, {size:.1f} MB")
+    echo(f"{options.out}: {tuned.updates} updates on annotated images{origin}, {size:.1f} MB")
     return 0
 
 
@@ -95,9 +95,9 @@ def _read_examples(options: DetectorTraining, folder: Path, settings: Settings, 
 
 def _split(options: DetectorTraining, names: list[str], examples: list[Example], echo: Any) -> Split:
     """Split the images by photograph into training, early-stopping and test sets, and report their sizes."""
-    from jaxrl_vis.stalks.phenotyping.training.photographs import MIN_IMAGES, photographs_of, split
+    from jaxrl_vis.stalks.phenotyping.training.photographs import MIN_IMAGES, group_by_photograph, split_images
 
-    parts = split(photographs_of(names, [example.image for example in examples]), options.seed)
+    parts = split_images(group_by_photograph(names, [example.image for example in examples]), options.seed)
     if not parts.test:
         echo(
             f"{parts.photographs} photographs, fewer than {MIN_IMAGES}: none is held out, "
@@ -114,8 +114,8 @@ def _split(options: DetectorTraining, names: list[str], examples: list[Example],
 def _report(
     page: Path,
     examples: list[Example],
-    parts: Split,
-    tuned: Tuned,
+    split: Split,
+    tuned: TuningResult,
     settings: Settings,
     start: Any,
     masks: bool,
@@ -125,10 +125,10 @@ def _report(
     import jax.numpy as jnp
 
     from jaxrl_vis.stalks.phenotyping.report.training_page import write_page
-    from jaxrl_vis.stalks.phenotyping.training.held_out import mask_overlap, score
+    from jaxrl_vis.stalks.phenotyping.training.held_out import mask_overlap, score_detections
 
-    test = [examples[place] for place in parts.test]
-    scores = {name: score(finds) for name, finds in (("before", tuned.before), ("after", tuned.after))}
+    test = [examples[place] for place in split.test]
+    scores = {name: score_detections(finds) for name, finds in (("before", tuned.before), ("after", tuned.after))}
     overlaps = dict.fromkeys(scores, math.nan)
     if masks:
         pairs = {"before": start, "after": tuned.params}
@@ -146,10 +146,10 @@ def _report(
             + (f", masks overlap {overlap:.2f}" if math.isfinite(overlap) else "")
         )
     facts = [
-        f"{len(parts.train)} images to learn from, {len(parts.stop)} to decide when to stop, {len(parts.test)} for this page; "
-        f"{parts.photographs} photographs, no copy of one on both sides.",
-        f"{tuned.made} updates in {tuned.update_s / 60:.1f} min after {tuned.compile_s:.0f} s of compilation; the end: "
-        f"{tuned.why}; the weights are those of update {tuned.steps}.",
+        f"{len(split.train)} images to learn from, {len(split.stop)} to decide when to stop, {len(split.test)} for this page; "
+        f"{split.photographs} photographs, no copy of one on both sides.",
+        f"{tuned.updates} updates in {tuned.update_s / 60:.1f} min after {tuned.compile_s:.0f} s of compilation; the end: "
+        f"{tuned.stop_reason}; the weights are those of update {tuned.best_step}.",
     ]
     write_page(page, facts, test, {"before": tuned.before, "after": tuned.after}, scores, overlaps)
     echo(f"{page}: the held-out images, before and after")
@@ -166,22 +166,22 @@ def _start(options: DetectorTraining, folder: Path, echo: Any) -> tuple[Any, Set
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
     from jaxrl_vis.stalks.phenotyping.io.calibration import find_calibration
-    from jaxrl_vis.stalks.phenotyping.training.annotated import settings_for
+    from jaxrl_vis.stalks.phenotyping.training.annotated import fit_settings
     from jaxrl_vis.stalks.phenotyping.training.detector_training import start_sections
 
     start = options.start or "shipped"
     calibrated = find_calibration(folder) is not None
     if start == "random":
         settings = Settings() if calibrated else Settings().for_sections()
-        return None, settings_for(folder, settings, options.label), ""
+        return None, fit_settings(folder, settings, options.label), ""
     params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
     origin = f", from {'the weights that ship' if start == 'shipped' else start}"
     if not calibrated and not settings.section:
         params, settings = start_sections(params, settings, options.seed)
         echo(f"{start}: {BAND_WEIGHTS}")
     if settings.section:
-        return params, settings_for(folder, settings, options.label), origin
-    fitting = settings_for(folder, settings, options.label)
+        return params, fit_settings(folder, settings, options.label), origin
+    fitting = fit_settings(folder, settings, options.label)
     if not 0.5 <= fitting.band_height / settings.band_height <= 2.0:
         why = (
             f"boxes of {folder} are {fitting.band_height:.0f} pixels tall in images of {fitting.width}, and those that "

@@ -24,10 +24,10 @@ from jaxrl_vis.stalks.grasping.perception.perceive import Perception, Variant, V
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
-from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, read_pair
+from jaxrl_vis.stalks.phenotyping.io.pair_reading import UnusablePairError, read_pair
 from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries
 from jaxrl_vis.stalks.phenotyping.report.tables import Row, write_rows
-from jaxrl_vis.stalks.results_folder import claim, file_state, is_current, pair_state, write_record
+from jaxrl_vis.stalks.results_folder import claim_folder, file_state, is_current, pair_state, write_record
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
@@ -103,7 +103,7 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
         runs: Folders of pairs.
         find: Function that returns the mask of a pair.
         request: Request, with the folder of the results.
-        done: Called after each run with its row.
+        done: Called after each run with its row of runs.csv, also if the run was up to date.
 
     Returns:
         A row for each pair that was skipped: run, pair, and reason.
@@ -113,7 +113,7 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
         OSError: A file cannot be written.
     """
     driven = read_odometries(runs, request.speed)
-    claim(
+    claim_folder(
         request.out,
         "runs",
         runs,
@@ -134,8 +134,8 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
     for folder in runs:
         path = request.out / "runs" / file_name(f"{folder.name}.json")
         sources = _sources(folder)  # before the files are read: they may be replaced meanwhile
-        if not is_current(path, sources, _is_whole):
-            write_record(path, _record(folder, driven[folder.name], find, request), sources)
+        if not is_current(path, sources, _is_complete):
+            write_record(path, _make_record(folder, driven[folder.name], find, request), sources)
         record = read_json(path)
         rows, points, skipped = [*rows, record["row"]], points + record["points"], skipped + record["skipped"]
         write_rows(request.out / "runs.csv", RUN_COLUMNS, rows)
@@ -146,20 +146,20 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
 
 
 def _sources(folder: PlotFolder) -> dict[str, Any]:
-    """Return the state of the files that the record of a run depends on."""
+    """Return the state of the files that the record of a run depends on: its odometry and the images of each pair."""
     return {
         "odometry": file_state(folder.folder / "odometry.csv"),
         "pairs": {pair.name: pair_state(pair) for pair in folder.pairs},
     }
 
 
-def _is_whole(record: dict[str, Any]) -> bool:
+def _is_complete(record: dict[str, Any]) -> bool:
     """Return True for a record with all columns and no skipped pairs; others are computed again."""
     known = record["row"].keys() == set(RUN_COLUMNS) and all(row.keys() == set(POINT_COLUMNS) for row in record["points"])
     return known and record["skipped"] == []
 
 
-def _record(folder: PlotFolder, distances: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:
+def _make_record(folder: PlotFolder, distances: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:
     """Compute the record of one run, and write its overlay.
 
     Args:
@@ -177,20 +177,20 @@ def _record(folder: PlotFolder, distances: dict[str, float] | None, find: Find, 
     for number, pair in enumerate(folder.pairs):
         try:
             left, right = read_pair(pair, calibration)
-        except Unusable as problem:
+        except UnusablePairError as problem:
             skipped.append({"run": folder.name, "pair": pair.name, "why": str(problem)})
             continue
         views.append(View(number, left, right, None if distances is None else distances.get(pair.name)))
     if not views:
-        return {"row": _row(folder, request, len(skipped), None, views), "points": [], "skipped": skipped}
+        return {"row": _make_row(folder, request, len(skipped), None, views), "points": [], "skipped": skipped}
     perception = perceive(
         views, lambda image, number: find(image, folder, folder.pairs[number]), calibration, request.mount, request.variant
     )
     (request.out / "overlays").mkdir(exist_ok=True)
     overlay = draw_points(views[-1].left, perception, calibration, request.mount)
     write_image(request.out / "overlays" / file_name(f"{folder.name}.png"), overlay)
-    points = _points(folder, request, perception)
-    return {"row": _row(folder, request, len(skipped), perception, views), "points": points, "skipped": skipped}
+    points = _point_rows(folder, request, perception)
+    return {"row": _make_row(folder, request, len(skipped), perception, views), "points": points, "skipped": skipped}
 
 
 def _can_reach(request: Request, perception: Perception) -> np.ndarray | None:
@@ -202,8 +202,8 @@ def _can_reach(request: Request, perception: Perception) -> np.ndarray | None:
     return np.asarray(request.reachable(points, stops), bool)
 
 
-def _row(folder: PlotFolder, request: Request, skipped: int, perception: Perception | None, views: list[View]) -> Row:
-    """Return the row of a run; ``perception`` is None if none of its pairs was usable."""
+def _make_row(folder: PlotFolder, request: Request, skipped: int, perception: Perception | None, views: list[View]) -> Row:
+    """Return the row of runs.csv for a run; ``perception`` is None if none of its pairs was usable."""
     row: Row = dict.fromkeys(RUN_COLUMNS, "")
     row |= {"run": folder.name, "pairs": len(views), "pairs_skipped": skipped, "grasp_points": 0}
     row |= {"method": request.method, "version": jaxrl_vis.__version__}
@@ -227,8 +227,8 @@ def _row(folder: PlotFolder, request: Request, skipped: int, perception: Percept
     }
 
 
-def _points(folder: PlotFolder, request: Request, perception: Perception) -> list[Row]:
-    """Return the rows of the grasp points of a run, in the robot frame of its last pair."""
+def _point_rows(folder: PlotFolder, request: Request, perception: Perception) -> list[Row]:
+    """Return the rows of points.csv for the grasp points of a run, in the robot frame of its last pair."""
     can = _can_reach(request, perception)
     rows = []
     for index, point in enumerate(perception.points):
@@ -255,7 +255,7 @@ def _points(folder: PlotFolder, request: Request, perception: Perception) -> lis
 def draw_points(left: np.ndarray, perception: Perception, calibration: Calibration, mount: Mount) -> np.ndarray:
     """Draw stalks in red and grasp points, numbered as in the table, on a copy of the last left image: [H, W, 3] uint8."""
     image = left.copy()
-    red = perception.clouds[-1].red
+    red = perception.clouds[-1].mask
     image[red] = (0.4 * image[red] + 0.6 * np.array([255, 0, 0])).astype(np.uint8)
     size = max(image.shape[1] // 170, 3)
     for index, point in enumerate(perception.points):

@@ -28,7 +28,7 @@ from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection, Detect
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
-from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, known_disparity, read_pair, read_side
+from jaxrl_vis.stalks.phenotyping.io.pair_reading import UnusablePairError, read_known_disparity, read_pair, read_side
 from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read_odometries
 from jaxrl_vis.stalks.phenotyping.measure.lens import UNTRIED, LensRange, lens_fault
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
@@ -46,17 +46,17 @@ from jaxrl_vis.stalks.phenotyping.report.tables import (
     rows_without_path,
     write_rows,
 )
-from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
+from jaxrl_vis.stalks.phenotyping.track.direction import track_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track
 from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
 from jaxrl_vis.stalks.phenotyping.track.sightings import NO_CALIBRATION, USUAL_DISTANCE, Sighting, row_distance, view_pair
-from jaxrl_vis.stalks.results_folder import claim, is_current, pair_state, write_record
+from jaxrl_vis.stalks.results_folder import claim_folder, is_current, pair_state, write_record
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, float | None, Band | None, PlotFolder, PairFiles], list[Detection]]
 """Stalk detector, called with a left image [H, W, 3] uint8, its pixels per metre at the row and the rows of the band (None if
-unknown), and its folder and files."""
+unknown), and its folder and files; returns the detections in pixels of the image."""
 NO_ODOMETRY = "no odometry"
 NO_FIT = "odometry does not fit the images"
 SKIPPED_COLUMNS = ("plot", "pair", "why")
@@ -73,7 +73,7 @@ class Request:
         calibrations: Calibration of each plot by its name; None if it has none.
         speed: Speed of the robot, m/s, for odometry with times only; None if unknown.
         disparity_scale: Divisor of disparities in 16-bit images.
-        tried: Range of lenses on which the detector was validated; None to accept any.
+        lens_range: Range of lenses on which the detector was validated; None to accept any.
         max_doubt: Doubt of the gate above which an image is reported as unfamiliar; None if there is no gate.
     """
 
@@ -83,7 +83,7 @@ class Request:
     calibrations: Mapping[str, Calibration | None]
     speed: float | None = None
     disparity_scale: float = 256.0
-    tried: LensRange | None = None
+    lens_range: LensRange | None = None
     max_doubt: float | None = None
 
 
@@ -113,7 +113,7 @@ def run(
         OSError: A file cannot be written.
     """
     distances = read_odometries(plots, request.speed)
-    claim(
+    claim_folder(
         request.out,
         "plots",
         plots,
@@ -130,11 +130,11 @@ def run(
         f"jaxrl-vis {jaxrl_vis.__version__}; finds by {request.finder}; widths by the method {request.method}.",
         "Tables: stalks.csv, plots.csv and skipped.csv; all pairs: overlays/.",
     ]
-    if request.tried is not None:
+    if request.lens_range is not None:
         about.append(
             "Counting and measuring was tried on synthetic rows of sorghum in the light of a flash alone, seen from aside with "
-            f"{request.tried.pixels_per_metre:.0f} pixels or more per metre of the row and {request.tried.view:.2f} m of it "
-            "from top to bottom; on no real row."
+            f"{request.lens_range.pixels_per_metre:.0f} pixels or more per metre of the row and "
+            f"{request.lens_range.view:.2f} m of it from top to bottom; on no real row."
         )
     with worker_pool(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
         return _run(plots, find, request, distances, page, done, echo, run_all)
@@ -150,7 +150,7 @@ def _run(
     echo: Callable[[str, str], None],
     run_all: UnorderedMap,
 ) -> tuple[list[Row], list[Row]]:
-    """Process plots one by one; see `run`."""
+    """Process plots one by one; return the rows of plots.csv and skipped.csv. See `run` for the arguments."""
     stalks: list[Row] = []
     rows: list[Row] = []
     skipped: list[Row] = []
@@ -159,10 +159,10 @@ def _run(
         folder.mkdir(parents=True, exist_ok=True)
         paths = {pair.name: folder / file_name(f"{pair.name}.json") for pair in plot.pairs}
         calibration = request.calibrations[plot.name]
-        missing = [pair for pair in plot.pairs if not is_current(paths[pair.name], _sources(pair, calibration), _is_whole)]
+        missing = [pair for pair in plot.pairs if not is_current(paths[pair.name], _sources(pair, calibration), _is_complete)]
         for number in range(1, len(plot.pairs) - len(missing) + 1):
             done(plot.name, number, len(plot.pairs))
-        made = run_all(functools.partial(_record, plot, find, request), missing)
+        made = run_all(functools.partial(_pair_record, plot, find, request), missing)
         for number, (name, record, sources) in enumerate(made, start=1):
             write_record(paths[name], record, sources)
             done(plot.name, len(plot.pairs) - len(missing) + number, len(plot.pairs))
@@ -172,9 +172,9 @@ def _run(
             for pair, record in zip(plot.pairs, records)
             if "skipped" in record
         ]
-        result = _finish(plot, records, distances[plot.name], request, run_all)
+        result = _finish_plot(plot, records, distances[plot.name], request, run_all)
         if result.row["stalks"] == "":
-            echo(plot.name, result.row["flag"] + (f" ({result.why})" if result.why else ""))
+            echo(plot.name, result.row["flag"] + (f" ({result.count_reason})" if result.count_reason else ""))
         page.add(result)
         stalks, rows, skipped = stalks + result.stalks, [*rows, result.row], skipped + bad
         write_rows(request.out / "stalks.csv", STALK_COLUMNS, stalks)
@@ -204,17 +204,18 @@ def _missing_count_reason(flag: str, frames: list[list[Sighting]], plot: PlotFol
 def _lens_fault(request: Request, frames: list[list[Sighting]], records: list[dict[str, Any]], name: str) -> str | None:
     """Return a message on why the lens of a plot is outside the validated range; None if it is within, or if unknown."""
     calibration = request.calibrations[name]
-    if request.tried is None or calibration is None or not records:
+    if request.lens_range is None or calibration is None or not records:
         return None
     first, last = np.median([record["lines"] for record in records], axis=0)
     distance = row_distance([sighting for frame in frames for sighting in frame]) or USUAL_DISTANCE
-    return lens_fault(calibration, distance, round(last - first), request.tried)
+    return lens_fault(calibration, distance, round(last - first), request.lens_range)
 
 
-def _is_whole(record: dict[str, Any]) -> bool:
-    """Return True if a record is complete and valid.
+def _is_complete(record: dict[str, Any]) -> bool:
+    """Return True if the record of a pair is complete and valid.
 
-    Raises KeyError, TypeError or ValueError for others, including those of skipped pairs, which are tried again.
+    Raises:
+        KeyError, TypeError, ValueError: It is not, or the pair was skipped, which is then tried again.
     """
     lines, columns = record["size"]
     for values in record["sightings"]:
@@ -233,20 +234,20 @@ def _sources(pair: PairFiles, calibration: Calibration | None) -> dict[str, Any]
     return {**pair_state(pair), "calibration": None if calibration is None else value_digest(dataclasses.asdict(calibration))}
 
 
-def _record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> tuple[str, dict[str, Any], dict[str, Any]]:
+def _pair_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """Return the name of a pair, its record, and the state of the record's sources."""
     calibration = request.calibrations[plot.name]
     sources = _sources(pair, calibration)  # before the files are read, as they may be replaced meanwhile
-    return pair.name, _sightings_record(plot, find, request, pair), sources
+    return pair.name, _make_record(plot, find, request, pair), sources
 
 
-def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> dict[str, Any]:
+def _make_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> dict[str, Any]:
     """Compute the record of a pair: its sightings, or the reason why it was skipped."""
     calibration = request.calibrations[plot.name]
     try:
         left, right = read_pair(pair, calibration, pair.disparity is None)
-        disparity = known_disparity(pair, left, request.disparity_scale)
-    except Unusable as problem:
+        disparity = read_known_disparity(pair, left, request.disparity_scale)
+    except UnusablePairError as problem:
         return {"skipped": str(problem)}
     view = view_pair(
         lambda image, pixels_per_metre, band: find(image, pixels_per_metre, band, plot, pair),
@@ -272,10 +273,18 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
     }
 
 
-def _finish(
+def _finish_plot(
     plot: PlotFolder, records: list[dict[str, Any]], distances: dict[str, float] | None, request: Request, run_all: UnorderedMap
 ) -> PlotResult:
-    """Track the stalks of a plot, compute its table rows, and render its overlays."""
+    """Track the stalks of a plot, compute its table rows, and render its overlays.
+
+    Args:
+        plot: Folder of the plot.
+        records: Record of each pair.
+        distances: Distance driven at each pair by the pair's name, m; None if unknown.
+        request: Options of the run.
+        run_all: Map over jobs in the worker processes.
+    """
     usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
     skipped = len(records) - len(usable)
     frames = [[Sighting.read(values) for values in record["sightings"]] for _, record in usable]
@@ -291,14 +300,14 @@ def _finish(
     elif calibration is not None and distances is not None and known and len(usable) >= 2:
         first, last = np.median([record["columns"] for _, record in usable], axis=0)
         driven_at = np.array([distances[pair.name] for pair, _ in usable])
-        drive = follow_either_way(frames, driven_at, calibration, (float(first), float(last)))
+        drive = track_either_way(frames, driven_at, calibration, (float(first), float(last)))
         flag = NO_FIT
-    if drive is None or not drive.fits:
+    if drive is None or not drive.is_consistent:
         stalks, row = rows_without_path(frames, skipped, origin, flag, metric=flag not in (NO_FIT, UNTRIED))
     else:
         tracks, path = drive.tracks, drive.path
         labels = sighting_labels(frames, tracks)
-        start = float(path.places[0])
+        start = float(path.positions[0])
         stalks, row = plot_rows(frames, tracks, path, skipped, origin)
     strange = _unfamiliar_note(request, [record for _, record in usable])
     if strange:
@@ -362,7 +371,7 @@ def _draw_overlay(plot: str, job: tuple[Path, PairFiles, list[Sighting], list[st
 
 
 def _tracking_fault(pairs: int, calibration: Calibration | None) -> str:
-    """Return a flag on why the stalks of a plot cannot be tracked."""
+    """Return a flag on why the stalks of a plot cannot be tracked: too few pairs, no calibration, or else no odometry."""
     if pairs == 0:
         return "no usable pairs"
     if calibration is None:

@@ -1,8 +1,8 @@
 """Images, goal images and true distances of a task, without a trained policy.
 
-hindsight   episodes of slowly changing random actions; the last image of each is its goal, so that all of them succeed
-pairs       images of episodes paired with goals: their own last image, that of another episode, and the goal that was given
-search      for each of several goals, the random sequence of actions with the highest reward: can the reward be exploited?
+play         episodes of slowly changing random actions
+make_pairs   images of episodes paired with goals: their own last image, that of another episode, and the goal that was given
+search       for each of several goals, the random sequence of actions with the highest reward: can the reward be exploited?
 """
 
 from collections.abc import Callable
@@ -51,18 +51,18 @@ class Pairs(NamedTuple):
     distance: Any
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """Result of a search over sequences of actions, for each of E goals.
 
     Attributes:
         reward: [E] float32, maximum reward at the end of an episode.
         is_reached: [E] bool, whether that episode truly reaches the goal.
-        could_reach: [E] bool, whether any of the sequences reaches it.
+        is_reachable: [E] bool, whether any of the sequences reaches it.
     """
 
     reward: Any
     is_reached: Any
-    could_reach: Any
+    is_reachable: Any
 
 
 def _actions(key: jax.Array, horizon: int, size: int) -> jax.Array:
@@ -77,7 +77,7 @@ def _actions(key: jax.Array, horizon: int, size: int) -> jax.Array:
 
 
 def play(env: GoalEnv, count: int, seed: int) -> Episodes:
-    """Roll out ``count`` episodes of random actions."""
+    """Roll out E = ``count`` episodes of slowly changing random actions; return NumPy arrays."""
 
     def episode(key: jax.Array) -> Episodes:
         start_key, action_key = jax.random.split(key)
@@ -97,7 +97,13 @@ def play(env: GoalEnv, count: int, seed: int) -> Episodes:
 
 
 def with_noise(pairs: Pairs, deviation: float, seed: int) -> Pairs:
-    """Add camera noise of standard deviation ``deviation`` grey levels to all images and goals, independently for each."""
+    """Return pairs with camera noise on all images and goals, independent for each: uint8, rounded and clipped.
+
+    Args:
+        pairs: Pairs of images and goals.
+        deviation: Standard deviation of the noise in grey levels; if it is 0, ``pairs`` are returned unchanged.
+        seed: Seed of the noise.
+    """
     if deviation == 0.0:
         return pairs
     draw = np.random.default_rng(seed)
@@ -110,7 +116,10 @@ def with_noise(pairs: Pairs, deviation: float, seed: int) -> Pairs:
 
 
 def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:
-    """Pair every image but the first with the last image of its episode, that of another episode, and the given goal."""
+    """Pair every image but the first with the last image of its episode, that of another episode, and the given goal.
+
+    The 3 E T pairs are in this order of goals; for each of them, episode by episode. ``seed`` determines the other episodes.
+    """
     count, length = episodes.images.shape[0], env.horizon
     draw = np.random.default_rng(seed)
     others = (np.arange(count) + draw.integers(1, max(2, count), count)) % count
@@ -124,7 +133,7 @@ def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:
     return Pairs(np.concatenate([flat[0]] * 3), np.concatenate(repeated), np.concatenate(distance))
 
 
-def search(env: GoalEnv, reward: Reward, goals: int, sequences: int, seed: int) -> Found:
+def search(env: GoalEnv, reward: Reward, goals: int, sequences: int, seed: int) -> SearchResult:
     """Search for actions that maximise a reward at the end of an episode, ``sequences`` random ones for each of ``goals``."""
 
     def of_goal(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -143,4 +152,4 @@ def search(env: GoalEnv, reward: Reward, goals: int, sequences: int, seed: int) 
         return rewards[best], is_reached[best], jnp.any(is_reached)
 
     episodes = jaxrl_vis_envs.jit(lambda keys: jax.lax.map(of_goal, keys))(jax.random.split(jax.random.key(seed), goals))
-    return Found(*map(np.asarray, episodes))
+    return SearchResult(*map(np.asarray, episodes))

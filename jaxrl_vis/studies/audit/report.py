@@ -40,7 +40,7 @@ def _with_errors_named(name: str, reward: Reward) -> Reward:
             raise
         except Exception as error:  # noqa: BLE001 - somebody else's code may raise anything
             file = getattr(getattr(reward, "__code__", None), "co_filename", None)
-            raise RequestError(f"reward {name} cannot be computed: {task_modules.blame(error, file)}") from error
+            raise RequestError(f"reward {name} cannot be computed: {task_modules.describe_error(error, file)}") from error
 
     return call
 
@@ -53,8 +53,8 @@ def _rewards(name: str, reward: Reward, images: np.ndarray, goals: np.ndarray) -
     """
     compiled, rows = jaxrl_vis_envs.jit(_with_errors_named(name, reward)), []
     for first in range(0, len(images), _BATCH):
-        part = np.arange(first, first + _BATCH) % len(images)  # the last batch wraps around, so that all have the same size
-        rows.append(np.asarray(compiled(images[part], goals[part]))[: len(images) - first])
+        indices = np.arange(first, first + _BATCH) % len(images)  # the last batch wraps around, so that all have the same size
+        rows.append(np.asarray(compiled(images[indices], goals[indices]))[: len(images) - first])
         if rows[-1].shape != (min(_BATCH, len(images) - first),):
             raise RequestError(f"reward {name} has the shape {rows[-1].shape[1:]} for each image: it must be one number")
     values = np.concatenate(rows).astype(np.float64)
@@ -111,7 +111,7 @@ def audit(
             "calibration_error": measures.calibration_error(predicted, is_reached),
             "exploited": float(np.mean(claimed & ~best.is_reached)),
             "solved": float(np.mean(best.is_reached)),
-            "solvable": float(np.mean(best.could_reach)),
+            "solvable": float(np.mean(best.is_reachable)),
         }
     return records, pairs, values
 
@@ -124,7 +124,15 @@ def table(records: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def draw(pairs: Pairs, values: Mapping[str, np.ndarray], threshold: float, unit: str, out: Path) -> None:
-    """Write a figure of rewards against true distances (quartiles in bins of the distance) and of their calibration."""
+    """Write a figure of rewards against true distances (quartiles in bins of the distance) and of their calibration.
+
+    Args:
+        pairs: Pairs of images and goals.
+        values: Rewards [N] of the pairs, by name of the reward.
+        threshold: Distance up to which a goal counts as reached.
+        unit: Unit of the distances.
+        out: File of the figure; its suffix determines the format.
+    """
     names: Sequence[Any] = list(values)
     figure = Figure(figsize=(3.1 * max(2, len(names)), 5.6), layout="constrained")
     axes = figure.subplots(2, max(2, len(names)), squeeze=False)
@@ -155,6 +163,6 @@ def draw(pairs: Pairs, values: Mapping[str, np.ndarray], threshold: float, unit:
     figure.savefig(out, dpi=120)
 
 
-def devices() -> str:
+def device_kind() -> str:
     """Return the kind of device on which audits run, for records."""
     return jax.devices()[0].device_kind

@@ -28,7 +28,7 @@ def _make_batch(images: jax.Array, goals: jax.Array) -> Batch:
 
 
 def _reward_of_run(run_dir: Path, trust: bool) -> Reward:
-    """Return the reward of the model that the first seed of a run has trained, scaled to [0, 1].
+    """Return the reward of the model that the first seed of a run has trained, scaled to [0, 1]; ``trust`` as in `open_run`.
 
     Raises:
         RequestError: The run has no reward model; from the reward: images have another shape.

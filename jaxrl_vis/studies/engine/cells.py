@@ -35,7 +35,7 @@ class Cell:
     @property
     def name(self) -> str:
         """Name of the cell and of its folder."""
-        return f"{self.family}-{show_budget(self.config.run.env_steps)}"
+        return f"{self.family}-{format_budget(self.config.run.env_steps)}"
 
     @property
     def seeds(self) -> range:
@@ -43,7 +43,7 @@ class Cell:
         return range(self.config.run.seed, self.config.run.seed + self.config.run.seeds)
 
 
-def show_budget(steps: int) -> str:
+def format_budget(steps: int) -> str:
     """Format a number of steps as ``250k`` or ``2.5M``, or with all digits if that would be inexact."""
     for size, letter in ((10**6, "M"), (10**3, "k")):
         if steps >= size and steps % (size // 100) == 0:
@@ -71,7 +71,7 @@ def split_seeds(cell: Cell, count: int) -> list[Cell]:
 def find_folder(cell: Cell, runs: Path) -> Path:
     """Find the folder of a cell: its own, unless only a longer run of its family has reached the cell's steps."""
     own = runs / cell.name
-    if _last_iteration(own, cell) is not None or not runs.is_dir():
+    if _final_env_steps(own, cell) is not None or not runs.is_dir():
         return own
     for folder in sorted(runs.glob(f"{cell.family}-*/")):
         try:
@@ -80,12 +80,12 @@ def find_folder(cell: Cell, runs: Path) -> Path:
             continue
         if contradictions(config, cell.config, UNMEASURED) or config.run.env_steps < cell.config.run.env_steps:
             continue
-        if _last_iteration(folder, cell) is not None:
+        if _final_env_steps(folder, cell) is not None:
             return folder
     return own
 
 
-def _last_iteration(folder: Path, cell: Cell) -> int | None:
+def _final_env_steps(folder: Path, cell: Cell) -> int | None:
     """Return the steps of the first evaluation of all seeds at or after the cell's environment steps; None without one.
 
     For a run that stops early, the evaluation at which it stops is sufficient.
@@ -122,20 +122,20 @@ def contradiction(cell: Cell, runs: Path) -> str | None:
 
 def is_finished(cell: Cell, runs: Path) -> bool:
     """Return True if a cell is completely trained and evaluated."""
-    return _last_iteration(find_folder(cell, runs), cell) is not None and contradiction(cell, runs) is None
+    return _final_env_steps(find_folder(cell, runs), cell) is not None and contradiction(cell, runs) is None
 
 
-def finished_rows(cell: Cell, runs: Path, as_it_is: bool = False) -> list[dict[str, Any]]:
+def finished_rows(cell: Cell, runs: Path, ignore_settings: bool = False) -> list[dict[str, Any]]:
     """Read the evaluations of a finished cell, up to its end, from metrics.jsonl; empty if it is not finished.
 
     Args:
         cell: The cell.
         runs: The folder of run folders.
-        as_it_is: Whether to accept a run with other settings, such as those of a preset in an earlier version.
+        ignore_settings: Whether to accept a run with other settings, such as those of a preset in an earlier version.
     """
     folder = find_folder(cell, runs)
-    end = _last_iteration(folder, cell)
-    if end is None or not (as_it_is or contradiction(cell, runs) is None):
+    end = _final_env_steps(folder, cell)
+    if end is None or not (ignore_settings or contradiction(cell, runs) is None):
         return []
     return [row for row in RunFolder(folder).rows() if row["env_steps"] <= end]
 
@@ -148,11 +148,11 @@ def describe_progress(cell: Cell, runs: Path) -> str:
     latest = latest_rows(find_folder(cell, runs))
     if not latest:
         return "not begun" if not find_folder(cell, runs).exists() else "not evaluated yet"
-    return f"{show_budget(latest[0]['env_steps'])} of {show_budget(cell.config.run.env_steps)} steps"
+    return f"{format_budget(latest[0]['env_steps'])} of {format_budget(cell.config.run.env_steps)} steps"
 
 
 def latest_rows(folder: Path) -> Sequence[dict[str, Any]]:
-    """Return the rows of a run's last evaluation, one per seed; none before the first."""
+    """Return the rows of a run's last evaluation, one per seed; empty before the first."""
     rows = RunFolder(folder).rows()
     last = max((row["env_steps"] for row in rows), default=0)
     return [row for row in rows if row["env_steps"] == last]

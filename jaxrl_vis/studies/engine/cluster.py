@@ -126,7 +126,7 @@ class Cluster:
         options: Parameters of submitit's executor as name=value, such as timeout_min=600 or slurm_partition=gpu.
 
     Raises:
-        RequestError: submitit or Slurm is missing, or an option is unknown.
+        RequestError: submitit or Slurm is missing, or an option is unknown or not of the form name=value.
     """
 
     def __init__(self, executor: ExecutorName, folder: Path, options: Sequence[str] = ()):

@@ -24,10 +24,10 @@ from jaxrl_vis.host import streams
 from jaxrl_vis.host.devices import Device
 from jaxrl_vis.host.provenance import child_environment
 from jaxrl_vis.run.command import training_options
-from jaxrl_vis.run.loggers.console import show_seconds
+from jaxrl_vis.run.loggers.console import format_seconds
 from jaxrl_vis.run.signals import SIGNALS, Interruption
 from jaxrl_vis.run.storage.folder import RunFolder
-from jaxrl_vis.studies.engine.cells import Cell, contradiction, is_finished, latest_rows, show_budget
+from jaxrl_vis.studies.engine.cells import Cell, contradiction, format_budget, is_finished, latest_rows
 from jaxrl_vis.studies.engine.cluster import Job
 
 _POLL_S = 0.2
@@ -54,7 +54,7 @@ def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str
 
 
 def train_command(cell: Cell, folder: Path, resume: bool) -> list[str]:
-    """Return the command that trains a cell."""
+    """Return the words of the command that trains a cell in ``folder``, or resumes its run there."""
     words = [sys.executable, "-m", "jaxrl_vis", "train", *training_options(cell.config), "--run-dir", str(folder)]
     return [*words, "--resume"] if resume else words
 
@@ -90,12 +90,12 @@ def run_cells(
         start: Function that starts a command.
 
     Returns:
-        One line for each failed cell.
+        One line for each cell that failed, or whose folder holds a run with other settings.
 
     Raises:
         RequestError: No device was found, or the folder cannot be written to.
         KeyboardInterrupt: Ctrl-C, after all processes have saved and ended.
-        Terminated: Another signal, likewise.
+        Terminated: Another signal, after all processes have saved and ended.
     """
     missing = [cell for cell in cells if not is_finished(cell, runs)]
     if not missing:
@@ -168,15 +168,15 @@ class _Grid:
     def _start(self, cell: Cell, device: Device) -> None:
         folder, log = self._runs / cell.name, self._runs / f"{cell.name}.log"
         words = self._command(cell, folder, RunFolder(folder).config.exists())
-        place = f"[{self._total - len(self._waiting)}/{self._total}] {cell.name}"
+        label = f"[{self._total - len(self._waiting)}/{self._total}] {cell.name}"
         process = self._start_command(words, log, device.environment)
         self._running.append(_Running(cell, device, process, log, time.monotonic()))
-        self._echo(f"{place}: {'resumes' if '--resume' in words else 'starts'} on {device.name}")
+        self._echo(f"{label}: {'resumes' if '--resume' in words else 'starts'} on {device.name}")
 
     def _end(self, done: _Running) -> None:
         self._running.remove(done)
         self._free.append(done.device)
-        status, took = done.process.wait(), show_seconds(time.monotonic() - done.started)
+        status, took = done.process.wait(), format_seconds(time.monotonic() - done.started)
         if status == 0 and is_finished(done.cell, self._runs):
             self._echo(f"{done.cell.name}: done in {took}{_success(self._runs / done.cell.name)}")
         elif self._is_stopping and (-status in SIGNALS or status - 128 in SIGNALS):
@@ -191,8 +191,8 @@ class _Grid:
 
     def _describe(self, running: _Running) -> str:
         latest = latest_rows(self._runs / running.cell.name)
-        steps = show_budget(latest[0]["env_steps"]) if latest else "0"
-        budget = show_budget(running.cell.config.run.env_steps)
+        steps = format_budget(latest[0]["env_steps"]) if latest else "0"
+        budget = format_budget(running.cell.config.run.env_steps)
         return f"{running.cell.name}: {steps} of {budget} steps{_success(self._runs / running.cell.name)}"
 
     def _stop(self, reason: str) -> None:
@@ -207,7 +207,7 @@ class _Grid:
                 running.process.send_signal(signal.SIGTERM)
 
     def _end_at_once(self) -> None:
-        """End all processes, after any error; does nothing if all have ended."""
+        """Terminate all processes that still run, and kill those that have not ended after 20 s."""
         self._signal()
         deadline = time.monotonic() + _GRACE_S
         for running in self._running:

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.learning import curve, steps_to
-from jaxrl_vis.report.plots import gather, show_steps
+from jaxrl_vis.report.plots import format_steps, gather
 from jaxrl_vis.run.storage.folder import read_record
 from jaxrl_vis.studies.engine.cells import Cell, describe_progress, differences, find_folder, finished_rows
 
@@ -25,14 +25,14 @@ class Line:
         task, variant: Names of the task and the variant.
         rows: Evaluations of all seeds, from metrics.jsonl.
         records: Contents of config.json of each of its runs.
-        unlike: Settings in which these runs differ from those that would be trained now.
+        setting_differences: Settings in which these runs differ from those that would be trained now.
     """
 
     task: str
     variant: str
     rows: Sequence[Mapping[str, Any]]
     records: Sequence[Mapping[str, Any]] = ()
-    unlike: Sequence[str] = ()
+    setting_differences: Sequence[str] = ()
 
     @property
     def points(self) -> list[tuple[int, float]]:
@@ -41,7 +41,7 @@ class Line:
 
     @property
     def seeds(self) -> list[int]:
-        """The seeds, ascending."""
+        """Seeds, in ascending order."""
         return sorted({row["seed"] for row in self.rows})
 
     @property
@@ -64,28 +64,30 @@ class Line:
 
 
 def read_lines(
-    cells: Mapping[tuple[str, str], Sequence[Cell]], runs: Path, as_they_are: bool = False
+    cells: Mapping[tuple[str, str], Sequence[Cell]], runs: Path, ignore_settings: bool = False
 ) -> tuple[dict[tuple[str, str], Line], list[str]]:
     """Read the lines of finished cells, and list unfinished ones.
 
     Args:
         cells: Runs of each line, by (task, variant).
         runs: Folder of the run folders.
-        as_they_are: Whether to read runs with other settings as well, such as those of a preset in an earlier version.
+        ignore_settings: Whether to read runs with other settings as well, such as those of a preset in an earlier version.
 
     Returns:
         Lines by (task, variant), without those with an unfinished cell; and a text for each unfinished cell.
     """
     lines, unfinished = {}, []
     for (task, variant), parts in cells.items():
-        rows_by_cell = [finished_rows(cell, runs, as_they_are) for cell in parts]
+        rows_by_cell = [finished_rows(cell, runs, ignore_settings) for cell in parts]
         unfinished += [
             f"{cell.name}: {describe_progress(cell, runs)}" for cell, rows in zip(parts, rows_by_cell, strict=True) if not rows
         ]
         if all(rows_by_cell):
             records = [_record(find_folder(cell, runs)) for cell in parts]
-            unlike = sorted({text for cell in parts for text in _differences(cell, runs)})
-            lines[task, variant] = Line(task, variant, [row for rows in rows_by_cell for row in rows], records, unlike)
+            setting_differences = sorted({text for cell in parts for text in _differences(cell, runs)})
+            lines[task, variant] = Line(
+                task, variant, [row for rows in rows_by_cell for row in rows], records, setting_differences
+            )
     return lines, unfinished
 
 
@@ -104,7 +106,7 @@ def _record(folder: Path) -> dict[str, Any]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Reached:
+class StepsToLevel:
     """Environment steps at which a level of success was reached, as defined in `jaxrl_vis.report.learning`.
 
     Attributes:
@@ -120,7 +122,7 @@ class Reached:
     high: float | None
     budget: int
 
-    def ratio(self, other: "Reached") -> str:
+    def ratio(self, other: "StepsToLevel") -> str:
         """Format the ratio of the other's steps to these: ``2.0``, or a bound if one of them did not reach the level."""
         if self.steps and other.steps:
             return f"{other.steps / self.steps:.1f}"
@@ -131,23 +133,23 @@ class Reached:
     def __str__(self) -> str:
         """Format the steps as ``120 k (100 k to 140 k)``, or ``> 250 k`` if the level was not reached."""
         if self.steps is None:
-            return f"> {show_steps(self.budget)}"
+            return f"> {format_steps(self.budget)}"
         if self.low is None:
-            return show_steps(self.steps)
-        high = "> " + show_steps(self.budget) if self.high is None else show_steps(self.high)
-        return f"{show_steps(self.steps)} ({show_steps(self.low)} to {high})"
+            return format_steps(self.steps)
+        high = "> " + format_steps(self.budget) if self.high is None else format_steps(self.high)
+        return f"{format_steps(self.steps)} ({format_steps(self.low)} to {high})"
 
 
-def reached(line: Line, level: float) -> Reached:
+def find_steps(line: Line, level: float) -> StepsToLevel:
     """Find the steps at which a line reached a level."""
     median = steps_to(line.points, level)
     if len(line.seeds) == 1:
-        return Reached(level, median, None, None, line.end)
+        return StepsToLevel(level, median, None, None, line.end)
     per_seed = [steps_to(curve([row for row in line.rows if row["seed"] == seed], SUCCESS), level) for seed in line.seeds]
     # Some values are only known to exceed the budget, so use quartiles without interpolation.
     quartiles = np.percentile([np.inf if steps is None else steps for steps in per_seed], [25, 75], method="inverted_cdf")
     low, high = (float(value) if np.isfinite(value) else None for value in quartiles)
-    return Reached(level, median, low, high, line.end)
+    return StepsToLevel(level, median, low, high, line.end)
 
 
 def mean_success(line: Line, up_to: int) -> float:
@@ -156,13 +158,13 @@ def mean_success(line: Line, up_to: int) -> float:
     return float(np.mean(values)) if values else 0.0
 
 
-def final(line: Line, metric: str = SUCCESS) -> tuple[float, float, float]:
+def final_quartiles(line: Line, metric: str = SUCCESS) -> tuple[float, float, float]:
     """Compute quartiles over seeds of a metric at the end: 25 %, median, 75 %."""
     values = [row[metric] for row in line.rows if row["env_steps"] == line.end and row.get(metric) is not None]
     return _quartiles(values)
 
 
-def area(line: Line) -> tuple[float, float, float]:
+def area_quartiles(line: Line) -> tuple[float, float, float]:
     """Compute quartiles over seeds of the mean success over all evaluations, the area under the curve: 25 %, median, 75 %."""
     return _quartiles([float(np.nanmean(row)) for row in line.values(SUCCESS)[1]])
 

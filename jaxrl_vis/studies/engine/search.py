@@ -106,7 +106,7 @@ class Request:
         trials: Number of trials, including those of earlier calls.
         runs: Folder of the run folders and the journal.
         seed: Seed of the proposals.
-        seconds: Time after which training stops.
+        seconds: Time in seconds after which training stops; None if unlimited.
     """
 
     config: Config
@@ -129,7 +129,8 @@ def run_search(
         True if all trials have ended.
 
     Raises:
-        RequestError: Optuna is missing, the folder holds another search, or see `run_cells`.
+        RequestError: No option varies or one does twice, Optuna is missing, the folder holds another search, or see
+            `run_cells`.
         KeyboardInterrupt, Terminated: A signal arrived; raised after all runs have saved.
     """
     if not request.ranges:
@@ -263,7 +264,7 @@ class _Search:
         self._echo(f"{len(done)} of {self._request.trials} trials done{f', {failed} failed' if failed else ''}")
         for trial in done[:_SHOWN]:
             shown = "  ".join(f"{name} {_shown(value)}" for name, value in trial.params.items())
-            self._echo(f"{f'trial-{trial.number}':10} {scores.metric(self._request.config)} {trial.value:.3f}  {shown}")
+            self._echo(f"{f'trial-{trial.number}':10} {scores.metric_name(self._request.config)} {trial.value:.3f}  {shown}")
         if done:
             (cell,) = self._cells({done[0].number: done[0].params}).values()
             self._echo(f"the best one: {training_command(cell.config)}")
@@ -272,10 +273,10 @@ class _Search:
 def _score(cell: Cell, rows: Sequence[Mapping[str, Any]]) -> float | None:
     """Return the score of the last evaluation in ``rows``; None without one, or if it is not finite."""
     last = max((row["iteration"] for row in rows), default=0)
-    values = [row.get(f"eval/{scores.metric(cell.config)}") for row in rows if row["iteration"] == last]
+    values = [row.get(f"eval/{scores.metric_name(cell.config)}") for row in rows if row["iteration"] == last]
     if not values or any(value is None or not math.isfinite(value) for value in values):
         return None
-    return scores.score(cell.config, {f"eval/{scores.metric(cell.config)}": values})  # type: ignore[dict-item]
+    return scores.score(cell.config, {f"eval/{scores.metric_name(cell.config)}": values})  # type: ignore[dict-item]
 
 
 def _shown(value: Any) -> str:

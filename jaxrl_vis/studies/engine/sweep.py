@@ -10,7 +10,7 @@ from jaxrl_vis.config import changes, preset, validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import streams
 from jaxrl_vis.host.devices import Device, list_devices
-from jaxrl_vis.studies.engine.cells import Cell, describe_progress, finished_rows, show_budget, split_seeds
+from jaxrl_vis.studies.engine.cells import Cell, describe_progress, finished_rows, format_budget, split_seeds
 from jaxrl_vis.studies.engine.cluster import Cluster, ExecutorName
 from jaxrl_vis.studies.engine.grid import run_cells, start_process
 
@@ -102,7 +102,7 @@ def _table(cells: Sequence[Cell], runs: Path) -> tuple[list[str], list[str]]:
         results.setdefault((cell.config.environment.env, cell.config.reward.method), {}).update(reached)
     lines = [f"{'task':28}{'method':28}{'steps':>8}{'seeds':>7}{'success: median':>17}{'least':>8}{'most':>8}"]
     for (task, method), success in results.items():
-        steps = show_budget(cells[0].config.run.env_steps)
+        steps = format_budget(cells[0].config.run.env_steps)
         values = [value for value in success.values() if value is not None]
         figures = (statistics.median(values), min(values), max(values)) if values else (float("nan"),) * 3
         lines.append(f"{task:28}{method:28}{steps:>8}{len(success):7}{figures[0]:17.3f}{figures[1]:8.3f}{figures[2]:8.3f}")

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.studies.engine.results import SUCCESS, Line, final, reached
+from jaxrl_vis.studies.engine.results import SUCCESS, Line, final_quartiles, find_steps
 from jaxrl_vis.studies.figures.drawing import Curve, Panel, Picture
 from jaxrl_vis.studies.figures.show import FigureContent, Request
 from jaxrl_vis.studies.figures.tables import table_row
@@ -17,8 +17,10 @@ LEVEL = 0.9
 _WALL, _COMPILATION = "time/wall_s", "time/compile_s"
 
 
-def show(_: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
-    """Create the content of the figure from its lines."""
+def make_content(
+    _: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]
+) -> FigureContent:
+    """Create the panels and tables of the figure for these tasks and variants, from its lines by (task, variant)."""
     shown = {key: line for key, line in lines.items() if key[1] in variants}
     of_steps = [Panel(f"{task}: success", _curves(shown, task)) for task in tasks]
     of_seconds = [Panel(f"{task}: success, by seconds", _curves(shown, task, by_seconds=True)) for task in tasks]
@@ -37,8 +39,8 @@ def _curves(lines: Mapping[tuple[str, str], Line], task: str, by_seconds: bool =
     for (of_task, variant), line in lines.items():
         if of_task == task:
             steps, values = line.values(SUCCESS)
-            places = np.array([_seconds(line, count) for count in steps]) if by_seconds else steps
-            curves.append(Curve(VARIANTS[variant].label, VARIANTS[variant].colour, places, values))
+            positions = np.array([_seconds(line, count) for count in steps]) if by_seconds else steps
+            curves.append(Curve(VARIANTS[variant].label, VARIANTS[variant].colour, positions, values))
     return curves
 
 
@@ -58,9 +60,9 @@ def _tables(lines: Mapping[tuple[str, str], Line], tasks: Sequence[str]) -> tupl
                 continue
             areas = [np.array([float(np.nanmean(row)) for row in line.values(SUCCESS)[1]])]
             mean, (low, high) = interquartile_mean(areas), bootstrap_interval(areas)
-            until = reached(line, LEVEL)
+            until = find_steps(line, LEVEL)
             seconds = None if until.steps is None else _seconds(line, until.steps)
-            end = final(line)
+            end = final_quartiles(line)
             cells = [f"{mean:.3f} ({low:.3f} to {high:.3f})", f"{end[1]:.3f} ({end[0]:.3f} to {end[2]:.3f})", str(until)]
             cells += ["–" if seconds is None else f"{seconds:.0f}", f"{_seconds(line, line.end):.0f}"]
             text.append(table_row([VARIANTS[variant].label, *cells]))

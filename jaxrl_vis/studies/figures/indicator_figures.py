@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.studies.engine.results import DISTANCE, SUCCESS, Line, area, final
+from jaxrl_vis.studies.engine.results import DISTANCE, SUCCESS, Line, area_quartiles, final_quartiles
 from jaxrl_vis.studies.figures.drawing import Curve, Panel, Picture
 from jaxrl_vis.studies.figures.show import FigureContent, Request
 from jaxrl_vis.studies.figures.tables import table_row
@@ -29,8 +29,10 @@ _ORACLE_WORKS: dict[str, tuple[str, float]] = {
 }
 
 
-def show(_: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
-    """Create the content of a figure from its lines."""
+def make_content(
+    _: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]
+) -> FigureContent:
+    """Create the panels and tables of a figure for these tasks and variants, from its lines by (task, variant)."""
 
     def row(metric: str, title: str, is_share: bool = True) -> list[Panel]:
         return [Panel(f"{task}: {title}", _curves(lines, task, variants, metric), is_share) for task in tasks]
@@ -88,9 +90,9 @@ def _figures(line: Line) -> dict[str, Quartiles | float]:
     """Compute quartiles over seeds of evaluation metrics, and medians of reward statistics."""
     filtered = _mean(line, _FILTERED)
     return {
-        "final_success": final(line, SUCCESS),
-        "area": area(line),
-        "final_distance": final(line, DISTANCE),
+        "final_success": final_quartiles(line, SUCCESS),
+        "area": area_quartiles(line),
+        "final_distance": final_quartiles(line, DISTANCE),
         "positive_share": _mean(line, "train/positive_share"),
         "false_positive_share": _mean(line, "train/false_positive_share"),
         "false_negative_share": _mean(line, "train/false_negative_share"),
@@ -138,12 +140,12 @@ def _oracle_notes(lines: Mapping[tuple[str, str], Line]) -> list[str]:
     notes = []
     for (task, variant), line in lines.items():
         if variant == "oracle" and task in _ORACLE_WORKS:
-            metric, wanted = _ORACLE_WORKS[task]
-            _, median, _ = final(line, metric)
-            if median < wanted if metric == SUCCESS else median > wanted:
+            metric, required = _ORACLE_WORKS[task]
+            _, median, _ = final_quartiles(line, metric)
+            if median < required if metric == SUCCESS else median > required:
                 quantity, bound = ("success", "at least") if metric == SUCCESS else ("final distance", "at most")
                 notes.append(
-                    f"{task}: the oracle itself ends at a {quantity} of {median:.3f}, where {bound} {wanted:g} is asked for: "
+                    f"{task}: the oracle itself ends at a {quantity} of {median:.3f}, where {bound} {required:g} is asked for: "
                     "this comparison of methods does not count."
                 )
     return notes

@@ -25,15 +25,15 @@ from jaxrl_vis.studies.figures.show import FigureContent, Request
 STUDIES: dict[str, Study] = {**indicator.STUDIES, **goals.STUDIES, **ol_aux.STUDIES}
 """Studies by figure."""
 
-_SHOW: dict[str, Callable[..., FigureContent]] = {
-    goals.FAMILY.name: goals_figure.show,
-    indicator.FAMILY.name: indicator_figures.show,
-    ol_aux.FAMILY.name: ol_aux_figures.show,
+_MAKE_CONTENT: dict[str, Callable[..., FigureContent]] = {
+    goals.FAMILY.name: goals_figure.make_content,
+    indicator.FAMILY.name: indicator_figures.make_content,
+    ol_aux.FAMILY.name: ol_aux_figures.make_content,
 }
 
 
 def make_figure(request: Request, echo: Callable[[str], None] = streams.echo) -> bool:
-    """Train missing cells and draw finished ones.
+    """Train missing cells, unless ``draw_only`` is set, and draw finished ones; the paths written are passed to ``echo``.
 
     Returns:
         True if all cells are finished and thus plotted.
@@ -53,7 +53,7 @@ def make_figure(request: Request, echo: Callable[[str], None] = streams.echo) ->
         run_cells(
             list(wanted.values()), request.runs, lambda: shared(list_devices(), request.per_device), request.seconds, echo=echo
         )
-    lines, unfinished = read_lines(cells, request.runs, as_they_are=request.draw_only)
+    lines, unfinished = read_lines(cells, request.runs, ignore_settings=request.draw_only)
     for text in unfinished:
         echo(f"not drawn: {text}")
     if not any(variant in variants for _, variant in lines):
@@ -70,7 +70,7 @@ def _write(
     """Write the images and both tables; return their paths."""
     study = request.study
     tasks = [task for task in request.tasks or study.steps if any((task, variant) in lines for variant in variants)]
-    content = _SHOW[study.family.name](request, lines, tasks, variants)
+    content = _MAKE_CONTENT[study.family.name](request, lines, tasks, variants)
     about, title, pictures = _about(request, list(lines.values())), content.title or study.title, []
     for picture in content.pictures:
         pictures.append(request.out.with_stem(request.out.stem + picture.suffix))
@@ -102,9 +102,10 @@ def _common_notes(study: Study, lines: dict[tuple[str, str], Line], unfinished: 
         if line.has_lost_replay()
     ]
     notes += [
-        f"{task}, {study.family.variants[variant].label}: not as it would be trained now, with {'; '.join(line.unlike)}."
+        f"{task}, {study.family.variants[variant].label}: not as it would be trained now, "
+        f"with {'; '.join(line.setting_differences)}."
         for (task, variant), line in lines.items()
-        if line.unlike
+        if line.setting_differences
     ]
     records = [record for line in lines.values() for record in line.records]
     for name, values in (

@@ -5,14 +5,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from jaxrl_vis.report.plots import show_steps
-from jaxrl_vis.run.storage.metrics import Place
+from jaxrl_vis.report.plots import format_steps
+from jaxrl_vis.run.storage.metrics import RowKeys
 from jaxrl_vis.studies.engine.results import SUCCESS, Line, read_lines
 from jaxrl_vis.studies.engine.study import make_cells
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
 from jaxrl_vis.studies.figures.drawing import Curve, Panel, Picture
 from jaxrl_vis.studies.figures.show import FigureContent, Request
-from jaxrl_vis.studies.figures.tables import BASELINE, Named, steps_table, weights_table
+from jaxrl_vis.studies.figures.tables import BASELINE, LabelledLine, steps_table, weights_table
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, LEVELS, STUDIES, VARIANTS, WEIGHTS
 
 _AUTHORS = "authors' release"
@@ -21,8 +21,8 @@ _ALONE = "5.5"  # the figure with runs of single tasks
 Lines = Mapping[tuple[str, str], Line]
 
 
-def show(request: Request, lines: Lines, tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
-    """Create the content of a figure from its lines."""
+def make_content(request: Request, lines: Lines, tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
+    """Create the panels and tables of a figure for these tasks and variants, from its lines by (task, variant)."""
     is_weights = request.figure == WEIGHTS
     panels = [Panel(task, (_weights if is_weights else _success)(lines, task, variants), not is_weights) for task in tasks]
     text, rows = _weights_table(request, lines, tasks) if is_weights else _steps_table(lines, tasks)
@@ -55,7 +55,7 @@ def _weights(lines: Lines, task: str, shown: Sequence[str]) -> list[Curve]:
 
 def _steps_table(lines: Lines, tasks: Sequence[str]):
     named = {
-        task: [Named(VARIANTS[variant].label, line) for (of_task, variant), line in lines.items() if of_task == task]
+        task: [LabelledLine(VARIANTS[variant].label, line) for (of_task, variant), line in lines.items() if of_task == task]
         for task in tasks
     }
     ends = {task: max(entry.line.end for entry in entries) for task, entries in named.items()}
@@ -65,9 +65,9 @@ def _steps_table(lines: Lines, tasks: Sequence[str]):
         known = [(steps, value) for steps, value in points if steps <= ends.get(task, 0)]
         if known:
             rows = [
-                Place(seed=0, iteration=0, updates=0, env_steps=steps)._asdict() | {SUCCESS: value} for steps, value in known
+                RowKeys(seed=0, iteration=0, updates=0, env_steps=steps)._asdict() | {SUCCESS: value} for steps, value in known
             ]
-            named[task].append(Named(VARIANTS[variant].label, Line(task, variant, rows), _AUTHORS))
+            named[task].append(LabelledLine(VARIANTS[variant].label, Line(task, variant, rows), _AUTHORS))
     return steps_table(named, LEVELS)
 
 
@@ -96,6 +96,6 @@ def _notes(request: Request, lines: Lines) -> list[str]:
             if difference is not None:
                 notes.append(
                     f"{task} without auxiliary losses: mean absolute difference to the authors' curve {difference:.3f}, over "
-                    f"its points to {show_steps(line.end)} steps."
+                    f"its points to {format_steps(line.end)} steps."
                 )
     return notes

@@ -6,14 +6,14 @@ from typing import Any
 
 from scipy.stats import spearmanr
 
-from jaxrl_vis.report.plots import show_steps
-from jaxrl_vis.studies.engine.results import Line, final, mean_success, mean_weight, reached
+from jaxrl_vis.report.plots import format_steps
+from jaxrl_vis.studies.engine.results import Line, final_quartiles, find_steps, mean_success, mean_weight
 
 BASELINE = "none"
 
 
 @dataclasses.dataclass(frozen=True)
-class Named:
+class LabelledLine:
     """Line with its label in tables.
 
     Attributes:
@@ -28,7 +28,7 @@ class Named:
 
 
 def steps_table(
-    lines: Mapping[str, Sequence[Named]], levels: Mapping[str, Sequence[float]]
+    lines: Mapping[str, Sequence[LabelledLine]], levels: Mapping[str, Sequence[float]]
 ) -> tuple[list[str], list[dict[str, Any]]]:
     """Tabulate steps to each level, and speed-ups over the baseline of the same source.
 
@@ -44,7 +44,7 @@ def steps_table(
     for task, named in lines.items():
         common = min(entry.line.end for entry in named)
         heads = [part for level in levels[task] for part in (f"steps to {level:g}", "speed-up")]
-        columns = ["method", *heads, f"mean success to {show_steps(common)}", "success at the end"]
+        columns = ["method", *heads, f"mean success to {format_steps(common)}", "success at the end"]
         text += [f"### {task}", "", table_row(columns), table_row(["---"] * len(columns))]
         for entry in named:
             base = next((b.line for b in named if b.line.variant == BASELINE and b.source == entry.source), None)
@@ -54,25 +54,25 @@ def steps_table(
     return text, rows
 
 
-def _label(named: Named) -> str:
+def _label(named: LabelledLine) -> str:
     return named.label if named.source == "here" else f"{named.label} ({named.source})"
 
 
-def _cells(named: Named, base: Line | None, levels: Sequence[float], common: int) -> list[str]:
+def _cells(named: LabelledLine, base: Line | None, levels: Sequence[float], common: int) -> list[str]:
     cells = [_label(named)]
     for level in levels:
-        result = reached(named.line, level)
+        result = find_steps(named.line, level)
         is_base = base is None or named.line.variant == BASELINE
-        cells += [str(result), "" if base is None or is_base else result.ratio(reached(base, level))]
-    low, median, high = final(named.line)
+        cells += [str(result), "" if base is None or is_base else result.ratio(find_steps(base, level))]
+    low, median, high = final_quartiles(named.line)
     end = f"{median:.2f}" if len(named.line.seeds) == 1 else f"{median:.2f} ({low:.2f} to {high:.2f})"
     return [*cells, f"{mean_success(named.line, common):.3f}", end]
 
 
-def _csv_rows(named: Named, base: Line | None, levels: Sequence[float], common: int) -> list[dict[str, Any]]:
+def _csv_rows(named: LabelledLine, base: Line | None, levels: Sequence[float], common: int) -> list[dict[str, Any]]:
     rows = []
     for level in levels:
-        result = reached(named.line, level)
+        result = find_steps(named.line, level)
         rows.append(
             dict(
                 task=named.line.task,
@@ -84,10 +84,10 @@ def _csv_rows(named: Named, base: Line | None, levels: Sequence[float], common: 
                 steps_25=result.low,
                 steps_75=result.high,
                 budget=result.budget,
-                speed_up="" if base is None or named.line.variant == BASELINE else result.ratio(reached(base, level)),
+                speed_up="" if base is None or named.line.variant == BASELINE else result.ratio(find_steps(base, level)),
                 mean_success=round(mean_success(named.line, common), 4),
                 mean_success_to=common,
-                final_success=round(final(named.line)[1], 4),
+                final_success=round(final_quartiles(named.line)[1], 4),
             )
         )
     return rows

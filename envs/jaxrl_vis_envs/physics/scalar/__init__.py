@@ -65,28 +65,28 @@ def simulate(model: mjx.Model, data: mjx.Data, count: int, exact: bool | None = 
     return _simulate_with(steps_kernel.simulate if has_kernel else steps.simulate_arrays, model, data, count, exact)
 
 
-def _simulate_boxes_with(take: Callable[..., JointState], model: mjx.Model, data: mjx.Data, count: int) -> mjx.Data:
-    """Implement `simulate` of a model with boxes with ``take``, a function with the arguments of `box_kernel.simulate`."""
+def _simulate_boxes_with(take_steps: Callable[..., JointState], model: mjx.Model, data: mjx.Data, count: int) -> mjx.Data:
+    """Implement `simulate` of a model with boxes with ``take_steps``, which has the arguments of `box_kernel.simulate`."""
     constants = box_model.build_box_model(model)
-    return _replaced(model, data, count, constants.tree, functools.partial(take, constants))
+    return _replace_state(model, data, count, constants.tree, functools.partial(take_steps, constants))
 
 
 def _simulate_with(
-    take: Callable[..., JointState], model: mjx.Model, data: mjx.Data, count: int, exact: bool | None
+    take_steps: Callable[..., JointState], model: mjx.Model, data: mjx.Data, count: int, exact: bool | None
 ) -> mjx.Data:
-    """Implement `simulate` with ``take``, a function with the arguments of `steps.simulate_arrays`."""
+    """Implement `simulate` with ``take_steps``, a function with the arguments of `steps.simulate_arrays`."""
     constants = scalar_model.build_scalar_model(model)
-    return _replaced(model, data, count, constants, functools.partial(take, constants, exact=exact))
+    return _replace_state(model, data, count, constants, functools.partial(take_steps, constants, exact=exact))
 
 
-def _replaced(
-    model: mjx.Model, data: mjx.Data, count: int, constants: ScalarModel, take: Callable[..., JointState]
+def _replace_state(
+    model: mjx.Model, data: mjx.Data, count: int, constants: ScalarModel, take_steps: Callable[..., JointState]
 ) -> mjx.Data:
-    """Return ``data`` with the state after ``count`` steps of ``take``; ``constants`` are those of the tree."""
+    """Return ``data`` with the state after ``count`` steps of ``take_steps``; ``constants`` are those of the tree."""
     state = JointState(data.qpos, data.qvel, data.qacc_warmstart, data.qfrc_constraint)
     indices = np.array(constants.mocaps, int)
     mocap = jnp.concatenate([data.mocap_pos[indices], data.mocap_quat[indices]], axis=1) if len(indices) else None
-    state = take(state, data.ctrl, data.qfrc_applied, timestep=float(model.opt.timestep), count=count, mocap=mocap)
+    state = take_steps(state, data.ctrl, data.qfrc_applied, timestep=float(model.opt.timestep), count=count, mocap=mocap)
     is_disturbed = jnp.any(data.xfrc_applied != 0)
     if constants.welds:
         is_disturbed = is_disturbed | ~jnp.all(data.eq_active)

@@ -55,7 +55,7 @@ class Softness(NamedTuple):
         return self.min_impedance + fraction * (self.max_impedance - self.min_impedance)
 
     def row_stiffness(self, inverse_weight: float, impedance: Any) -> Any:
-        """Return MuJoCo's ``efc_D``: the inverse of the regularized part of the constraint's inverse inertia.
+        """Return MuJoCo's ``efc_D``: the inverse of the regularization ``inverse_weight * (1 - impedance) / impedance``.
 
         Args:
             inverse_weight: Approximate inverse inertia along the constraint.
@@ -71,7 +71,7 @@ def make_softness(solref: np.ndarray, solimp: np.ndarray, timestep: float, is_sa
 
     Args:
         solref: [2] float, time constant (s) and damping ratio, or negative stiffness and damping.
-        solimp: [5] float.
+        solimp: [5] float, minimum and maximum impedance, width (m or rad), midpoint and power (see `Softness`).
         timestep: Physics time step, s.
         is_safe: Keep the time constant at two time steps or more (MuJoCo's ``refsafe``).
     """

@@ -147,7 +147,10 @@ def contact_axes(normal: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def translation_jacobian(pair: GeomPair, frames: LinkFrames, direction: Vector, position: Vector) -> dict[int, Any]:
-    """Return derivatives by joint of the displacement, second geom minus first, along ``direction`` at ``position``."""
+    """Return derivatives by joint of the displacement, second geom minus first, along ``direction`` at ``position`` (m).
+
+    Both are in the base frame of ``frames``.
+    """
     moment = cross(position, direction)
     back = (scale(direction, -1.0), scale(moment, -1.0))
     entries = {joint: frames.derivative_along(joint, *back) for joint in pair.joints_of_one[0]}

@@ -101,7 +101,7 @@ def child_pose(link: Link, joint: JointTransform, parent: Pose) -> Pose:
 
 
 def mass_matrix(links: list[Link], joints: list[JointTransform]) -> dict[tuple[int, int], Any]:
-    """Return the mass matrix (kg m^2, kg m, kg) between each joint and its ancestors: (joint, ancestor) -> entry."""
+    """Return the mass matrix (kg m^2, kg m, kg): (joint, ancestor) -> entry, for each joint with its ancestors and itself."""
     composite = [_CompositeInertia(link.mass, _vector(link.moment), _symmetric(link.inertia)) for link in links]
     matrix: dict[tuple[int, int], Any] = {}
     for index in reversed(range(len(links))):
@@ -109,15 +109,15 @@ def mass_matrix(links: list[Link], joints: list[JointTransform]) -> dict[tuple[i
         # Momentum of the link and its descendants at unit velocity of the joint.
         axis = _unit(link.axis)
         if link.slides:
-            impulse, spin = scale(axis, composite[index].mass), cross(composite[index].moment, axis)
+            linear, angular = scale(axis, composite[index].mass), cross(composite[index].moment, axis)
         else:
-            impulse, spin = cross(axis, composite[index].moment), symmetric_times(composite[index].inertia, axis)
+            linear, angular = cross(axis, composite[index].moment), symmetric_times(composite[index].inertia, axis)
         ancestor = index
         while True:
-            matrix[index, ancestor] = (impulse if links[ancestor].slides else spin)[links[ancestor].axis]
+            matrix[index, ancestor] = (linear if links[ancestor].slides else angular)[links[ancestor].axis]
             if links[ancestor].parent < 0:
                 break
-            impulse, spin = _wrench_to_parent(links[ancestor], joints[ancestor], impulse, spin)
+            linear, angular = _wrench_to_parent(links[ancestor], joints[ancestor], linear, angular)
             ancestor = links[ancestor].parent
         if link.parent >= 0:
             composite[link.parent] = _sum_inertias(
@@ -162,11 +162,14 @@ def bias_forces(
 
 
 class _LinkMotion:
-    """Motion of a link in its own frame: angular velocity and acceleration, and the acceleration of the frame's origin."""
+    """Motion of a link in its own frame: angular velocity omega and acceleration alpha, acceleration of the frame's origin.
 
-    def __init__(self, spin: Vector, change: Vector, lift: Vector) -> None:
-        self._spin, self._change, self._lift = spin, change, lift
-        (x, y, z), (a, b, c) = spin, change
+    Gravity is included as an upward acceleration of the world.
+    """
+
+    def __init__(self, omega: Vector, alpha: Vector, acceleration: Vector) -> None:
+        self._omega, self._alpha, self._acceleration = omega, alpha, acceleration
+        (x, y, z), (a, b, c) = omega, alpha
         xx, yy, zz = times(x, x), times(y, y), times(z, z)
         xy, yz, xz = times(x, y), times(y, z), times(x, z)
         # Columns of the matrix from a point's position to its acceleration relative to the origin.
@@ -178,19 +181,20 @@ class _LinkMotion:
 
     def child(self, link: Link, joint: JointTransform, rate: Any) -> "_LinkMotion":
         """Return the motion of a child link whose joint moves at ``rate`` without acceleration."""
-        lift = _to_link(link, joint, add(self._lift, combine(self._acceleration_columns, _origin_in_parent(link, joint))))
-        spin, change = _to_link(link, joint, self._spin), _to_link(link, joint, self._change)
+        relative = combine(self._acceleration_columns, _origin_in_parent(link, joint))
+        acceleration = _to_link(link, joint, add(self._acceleration, relative))
+        omega, alpha = _to_link(link, joint, self._omega), _to_link(link, joint, self._alpha)
         own = scale(_unit(link.axis), rate)
         if link.slides:
-            return _LinkMotion(spin, change, add(lift, scale(cross(spin, own), 2.0)))
-        return _LinkMotion(add(spin, own), add(change, cross(spin, own)), lift)
+            return _LinkMotion(omega, alpha, add(acceleration, scale(cross(omega, own), 2.0)))
+        return _LinkMotion(add(omega, own), add(alpha, cross(omega, own)), acceleration)
 
     def wrench(self, link: Link) -> tuple[Vector, Vector]:
         """Return the force, and the torque about the frame's origin, that produce this motion of the link."""
         moment, inertia = _vector(link.moment), _symmetric(link.inertia)
-        force = add(scale(self._lift, link.mass), combine(self._acceleration_columns, moment))
-        turning = add(symmetric_times(inertia, self._change), cross(self._spin, symmetric_times(inertia, self._spin)))
-        return force, add(turning, cross(moment, self._lift))
+        force = add(scale(self._acceleration, link.mass), combine(self._acceleration_columns, moment))
+        torque = add(symmetric_times(inertia, self._alpha), cross(self._omega, symmetric_times(inertia, self._omega)))
+        return force, add(torque, cross(moment, self._acceleration))
 
 
 def _unit(axis: int) -> Vector:

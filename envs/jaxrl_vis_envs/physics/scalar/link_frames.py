@@ -15,22 +15,22 @@ _IDENTITY = Pose(ZERO, tuple(floats(axis) for axis in np.eye(3)))  # type: ignor
 
 
 class MocapPose(NamedTuple):
-    """Pose of a mocap body in the world, which is constant during a step, and its quaternion."""
+    """Pose of a mocap body in the world, which is constant during a step, and its rotation as a unit quaternion."""
 
     pose: Pose
     quaternion: Quaternion
 
 
-def mocap_poses(links: tuple[int, ...], numbers: Column) -> dict[int, MocapPose]:
+def mocap_poses(links: tuple[int, ...], coordinates: Column) -> dict[int, MocapPose]:
     """Return the poses of mocap bodies by link.
 
     Args:
         links: Links of the mocap bodies (`links.mocap_link`).
-        numbers: Seven scalars per body: position, m, and a quaternion of any norm.
+        coordinates: Seven scalars per body: position, m, and a quaternion of any norm.
     """
     poses = {}
     for index, link in enumerate(links):
-        x, y, z, *quaternion = numbers[7 * index : 7 * (index + 1)]
+        x, y, z, *quaternion = coordinates[7 * index : 7 * (index + 1)]
         quaternion = quaternions.normalize(quaternion)
         poses[link] = MocapPose(Pose((x, y, z), quaternions.rotation_axes(quaternion)), quaternion)
     return poses
@@ -41,6 +41,12 @@ class LinkFrames:
 
     Frames of mocap bodies and their descendants are available only if the base is the world. Quaternions are relative to the
     world whatever the base is.
+
+    Args:
+        tree: Links of the model, one per joint.
+        joints: Transforms of the joints; `quaternion` needs the half turns of those above its link.
+        base: Link of the base frame, or `WORLD`; only its descendants have frames.
+        mocap: Poses of mocap bodies, by link.
     """
 
     def __init__(self, tree: list[Link], joints: list[JointTransform], base: int, mocap: dict[int, MocapPose]) -> None:

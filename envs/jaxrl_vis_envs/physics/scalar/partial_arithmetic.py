@@ -19,7 +19,7 @@ Symmetric = dict[tuple[int, int], Any]  # (row, column) -> entry, row <= column
 ZERO: Vector = (0.0, 0.0, 0.0)
 
 
-def _is(number: Any, value: float) -> bool:
+def _equals(number: Any, value: float) -> bool:
     return isinstance(number, float) and number == value
 
 
@@ -39,7 +39,7 @@ def minus(left: Any, right: Any) -> Any:
     """Return ``left - right``."""
     if isinstance(right, float):
         return plus(left, -right)
-    return -right if _is(left, 0.0) else left - right
+    return -right if _equals(left, 0.0) else left - right
 
 
 def times(*factors: Any) -> Any:

@@ -169,8 +169,9 @@ def supports(model: mjx.Model) -> bool:
     The subset of MuJoCo: concrete numbers, no tracers; up to 32 hinges and slides; up to 32 explicit contact pairs, each of two
     capsules or of a plane and a sphere, frictionless or with elliptic or pyramidal cones, the latter also with torsional
     friction; limits; dry friction of joints; fixed tendons; joint actuators without activation; mocap bodies; and welds of
-    bodies that are active from the start. Not supported: other equalities, sensors, fluids and gravity compensation. The solver
-    is Newton's; the integrator is Euler's, implicit in the damping, or RK4.
+    bodies that are active from the start. Exponents of impedances are integers up to 6. Not supported: other equalities,
+    sensors, fluids, gravity compensation, and limits of the actuator force on a joint. The solver is Newton's; the integrator
+    is Euler's, implicit in the damping, or RK4.
     """
     if not is_concrete(model):
         return False
@@ -319,7 +320,7 @@ def _actuator(model: mjx.Model, index: int) -> Actuator:
 
 
 def build_softness(model: mjx.Model, solref: object, solimp: object) -> Softness:
-    """Return the constants of a constraint of a model with these numbers of MuJoCo."""
+    """Return the softness of a constraint with MuJoCo's parameters ``solref`` [2] and ``solimp`` [5], in a model."""
     is_safe = not int(model.opt.disableflags) & _FLAG.mjDSBL_REFSAFE
     return constraint_softness.make_softness(np.asarray(solref), np.asarray(solimp), float(model.opt.timestep), is_safe)
 
@@ -393,13 +394,13 @@ def _welds(model: mjx.Model, tree: list[Link], frames: list[FixedFrame]) -> list
     return constraints
 
 
-def fingerprint(part: Any) -> Hashable:
+def fingerprint(value: Any) -> Hashable:
     """Convert a `ScalarModel` or a part of it to a hashable value that is equal for equal contents."""
-    if isinstance(part, np.ndarray):
-        return part.shape, part.tobytes()
-    if isinstance(part, dict):
-        return tuple((key, fingerprint(value)) for key, value in part.items())
-    return tuple(map(fingerprint, part)) if isinstance(part, list | tuple) else part
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes()
+    if isinstance(value, dict):
+        return tuple((key, fingerprint(item)) for key, item in value.items())
+    return tuple(map(fingerprint, value)) if isinstance(value, list | tuple) else value
 
 
 def base_link(constants: ScalarModel) -> int:

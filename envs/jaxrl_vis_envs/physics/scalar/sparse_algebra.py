@@ -17,17 +17,17 @@ Row = dict[int, Any]  # column -> nonzero entry
 Matrix = dict[tuple[int, int], Any]  # (row, column) -> nonzero entry
 
 
-def solve_positive(matrix: Matrix, right: Column) -> Column:
+def solve_positive(matrix: Matrix, rhs: Column) -> Column:
     """Solve a symmetric positive definite system.
 
     Args:
         matrix: Entries on and below the diagonal.
-        right: Right side, one scalar per row.
+        rhs: Right-hand side, one scalar per row.
     """
-    factors, inverse = _factorize(matrix, len(right))
-    half = _solve_transposed(factors, right)
+    factors, inverse = _factorize(matrix, len(rhs))
+    half = _solve_transposed(factors, rhs)
     solution = [value * scale for value, scale in zip(half, inverse, strict=True)]
-    for row in range(len(right)):
+    for row in range(len(rhs)):
         for column, factor in factors[row].items():
             solution[row] = solution[row] - factor * solution[column]
     return solution
@@ -48,9 +48,9 @@ def _factorize(matrix: Matrix, size: int) -> tuple[list[Row], Column]:
     return factors, inverse
 
 
-def _solve_transposed(factors: list[Row], right: Column) -> Column:
+def _solve_transposed(factors: list[Row], rhs: Column) -> Column:
     """Solve a linear system with the matrix L'."""
-    values = list(right)
+    values = list(rhs)
     for row in reversed(range(len(values))):
         for column, factor in factors[row].items():
             values[column] = values[column] - factor * values[row]
@@ -58,12 +58,12 @@ def _solve_transposed(factors: list[Row], right: Column) -> Column:
 
 
 def add_square(matrix: Matrix, row: Row, weight: Any) -> None:
-    """Add the weighted outer product of a row with itself, on and below the diagonal."""
+    """Add the weighted outer product of a row with itself to ``matrix`` in place, on and below the diagonal."""
     add_product(matrix, row, row, weight)
 
 
 def add_product(matrix: Matrix, left: Row, right: Row, weight: Any) -> None:
-    """Add the weighted outer product of two rows, on and below the diagonal."""
+    """Add the weighted outer product of two rows to ``matrix`` in place, on and below the diagonal."""
     for row, entry in left.items():
         scaled = weight * entry
         for column, factor in right.items():

@@ -59,7 +59,7 @@ class StepInputs(NamedTuple):
 
 
 class ConstraintRow(NamedTuple):
-    """Row of a `scalar_newton.Problem`, with its fields; ``max_friction`` is None except for dry friction."""
+    """Row of a `scalar_newton.Problem`: ``jacobian`` entries, and its fields; ``max_friction`` is None unless dry friction."""
 
     entries: Row
     stiffness: Any
@@ -97,7 +97,7 @@ def simulate(
     Returns:
         The state after the steps.
     """
-    control = clipped_controls(constants, control)
+    control = clip_controls(constants, control)
     poses = link_frames.mocap_poses(tuple(links.mocap_link(index) for index in constants.mocaps), list(mocap))
     inputs = StepInputs(timestep, control, applied, poses)
 
@@ -109,7 +109,7 @@ def simulate(
     return jax.lax.fori_loop(0, count, advance, state)
 
 
-def clipped_controls(constants: ScalarModel, control: Column) -> Column:
+def clip_controls(constants: ScalarModel, control: Column) -> Column:
     """Clip the controls, one per actuator, to their bounds."""
     bounds = [actuator.control_bounds for actuator in constants.actuators]
     return [_clip(number, pair) for number, pair in zip(control, bounds, strict=True)]
@@ -125,7 +125,7 @@ def simulate_arrays(
     exact: bool | None,
     mocap: jax.Array | None = None,
 ) -> JointState:
-    """Call `simulate` with arrays: [N] each for N joints, controls [nu], mocap bodies [M, 7] or None."""
+    """Call `simulate` with float32 arrays, outside of kernels: [N] each for N joints, controls [nu], mocap bodies [M, 7]."""
     start = JointState(*map(list, state))
     poses = [] if mocap is None else list(mocap.reshape(-1))
     end = simulate(constants, start, list(control), list(applied), timestep, count, bool(exact), mocap=poses)
@@ -280,8 +280,8 @@ def elimination_order(size: int, mass: list[tuple[int, int]], rows: list[tuple[i
     return backwards[::-1]
 
 
-def _below_diagonal(one: int, other: int) -> tuple[int, int]:
-    return (one, other) if one > other else (other, one)
+def _below_diagonal(row: int, column: int) -> tuple[int, int]:
+    return (row, column) if row > column else (column, row)
 
 
 def _add_tendon(mass: Matrix, coefficients: dict[int, float], armature: float) -> None:

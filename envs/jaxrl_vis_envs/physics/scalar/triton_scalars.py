@@ -23,7 +23,7 @@ from jax.interpreters import mlir
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 WARP_SIZE = 32
-"""Threads of a kernel's program."""
+"""Number of threads of a kernel's program, one warp."""
 _COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
 
 Compute = Callable[[Any, list[jax.Array]], Iterable[Any]]

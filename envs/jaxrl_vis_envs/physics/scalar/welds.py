@@ -52,7 +52,8 @@ class WeldResidual(NamedTuple):
     """Violation of a weld.
 
     Attributes:
-        errors: Three position errors, in the world, and three scaled halves of the rotation error, m.
+        errors: Three position errors, in the world, and the imaginary part of the rotation error's quaternion times
+            ``torque_scale``, m.
         entries: Derivative of each error with respect to each joint, m/rad or m/m.
         norm: Norm of the six errors, m.
     """

@@ -17,13 +17,13 @@ _HORIZON = SHAPE[0] // 2
 _PHOTOGRAPHS = (("skimage", "data"), ("sklearn", "datasets/images"))
 
 
-def draw_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky: float) -> np.ndarray:
+def sample_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky: float) -> np.ndarray:
     """Sample a backdrop.
 
     Args:
         rng: Random number generator.
-        indoors: Whether to draw a wall and a ceiling instead of the sky and a skyline.
-        photograph: Whether to use a photograph shipped with an installed package instead; takes precedence over ``indoors``.
+        indoors: Sample a wall and a ceiling instead of the sky and a skyline.
+        photograph: Use a photograph shipped with an installed package instead; takes precedence over ``indoors``.
         sky: Light of the sky on a white surface, which scales the radiance.
 
     Returns:
@@ -39,7 +39,7 @@ def draw_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky
 
 
 def smooth_noise(rng: np.random.Generator, size: tuple[float, float], shape: tuple[int, int] = SHAPE) -> np.ndarray:
-    """Sample smooth noise [*shape], uniformly distributed in 0 to 1.
+    """Sample smooth noise, uniformly distributed in 0 to 1: [*shape] float64.
 
     Args:
         rng: Random number generator.
@@ -72,10 +72,10 @@ def _outdoors(rng: np.random.Generator) -> np.ndarray:
     return picture
 
 
-def _skyline(rng: np.random.Generator, high: float, roughness: tuple[float, float]) -> np.ndarray:
-    """Sample a mask [*SHAPE] bool from the horizon up to an uneven skyline with a mean tangent of about ``high``."""
+def _skyline(rng: np.random.Generator, height: float, roughness: tuple[float, float]) -> np.ndarray:
+    """Sample a mask [*SHAPE] bool from the horizon up to an uneven skyline with a mean tangent of about ``height``."""
     line = sum(smooth_noise(rng, (1, size), (1, SHAPE[1]))[0] * weight for size, weight in zip((8, 60), roughness))
-    top = _HORIZON * (1.0 - high * (0.5 + line) / REACH[0])
+    top = _HORIZON * (1.0 - height * (0.5 + line) / REACH[0])
     lines = np.arange(SHAPE[0])[:, None]
     return (lines >= top) & (lines < _HORIZON + 12)
 

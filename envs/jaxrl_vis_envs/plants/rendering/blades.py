@@ -1,4 +1,4 @@
-"""Blades of grass over the ground of plots by day: upright strips, as stalks are, and no stalks. NumPy and Pillow only."""
+"""Blades of grass on the ground of plots by day: upright strips that resemble stalks. NumPy and Pillow only."""
 
 import dataclasses
 
@@ -7,8 +7,8 @@ from PIL import Image, ImageDraw
 
 from jaxrl_vis_envs.plants.rendering.surfaces import GROUND
 
-_NEAREST = 0.15
-"""Minimum depth of a blade that is drawn, m."""
+_MIN_DEPTH = 0.15
+"""Minimum depth of a rendered blade, m."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Blades:
     tint: np.ndarray
 
 
-def draw_blades(rng: np.random.Generator, length: float, distance: float) -> Blades:
+def sample_blades(rng: np.random.Generator, length: float, distance: float) -> Blades:
     """Sample the blades around a row from x = 0 to ``length`` and y = 0, seen from y = -``distance`` (m)."""
     low, high = np.array([-2.0, -distance + 0.25]), np.array([length + 2.0, 3.0])
     count = int(np.exp(rng.uniform(np.log(50.0), np.log(500.0))) * np.prod(high - low))
@@ -41,28 +41,28 @@ def draw_blades(rng: np.random.Generator, length: float, distance: float) -> Bla
     return Blades(np.stack([base, middle, tip], axis=1), rng.uniform(0.002, 0.006, count), tint)
 
 
-def cover_with_blades(
+def render_blades(
     radiance: np.ndarray,
     instance: np.ndarray,
     depth: np.ndarray,
     blades: Blades,
     camera: tuple[np.ndarray, np.ndarray, float, tuple[float, float]],
 ) -> np.ndarray:
-    """Draw blades into an image, in front of what is farther away.
+    """Render blades into an image, where they occlude its surfaces.
 
     Args:
         radiance: [H, W, 3] float32, linear.
         instance: [H, W] int32, see `surfaces`.
         depth: [H, W] float32, planar, m.
         blades: Blades of the plot.
-        camera: Position [3] and rotation [3, 3] of the camera as of a `Pose`, focal length and principal point, pixels.
+        camera: Position [3] (m) and rotation [3, 3], as in a `Pose`; focal length and principal point, pixels.
 
     Returns:
-        Radiance [H, W, 3] float32 with the blades. Instances and depths are to remain those of the plot without blades.
+        Radiance [H, W, 3] float32 with the blades. Instance and depth images are not changed: blades are not in them.
     """
     position, rotation, focal, centre = camera
     seen = (blades.points - position) @ rotation.T
-    there = np.flatnonzero(seen[:, :, 2].min(axis=1) > _NEAREST)
+    there = np.flatnonzero(seen[:, :, 2].min(axis=1) > _MIN_DEPTH)
     there = there[np.argsort(-seen[there, 0, 2])]
     across = seen[there, :, :2] / seen[there, :, 2:] * focal + np.array(centre)
     half = np.maximum(0.5 * focal * blades.width[there] / seen[there, 0, 2], 0.3)
@@ -87,11 +87,11 @@ def cover_with_blades(
     return covered
 
 
-def _ground_at(radiance: np.ndarray, instance: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return the radiance [B, 3] of the ground at pixels [B, 2]; the median of the ground where something else is there."""
+def _ground_at(radiance: np.ndarray, instance: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return the radiance [B, 3] of the ground at pixels (column, row) [B, 2]; its median where it is not visible."""
     ground = instance == GROUND
     median = np.median(radiance[ground], axis=0) if ground.any() else np.zeros(3)
-    column, line = np.round(places).astype(int).T
+    column, line = np.round(pixels).astype(int).T
     height, width = instance.shape
     inside = (line >= 0) & (line < height) & (column >= 0) & (column < width)
     line, column = np.clip(line, 0, height - 1), np.clip(column, 0, width - 1)

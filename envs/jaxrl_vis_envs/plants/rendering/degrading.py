@@ -16,7 +16,7 @@ def degrade(image: np.ndarray, scene: Scene, rng: np.random.Generator) -> tuple[
 
     Args:
         image: [H, W, 3] uint8.
-        scene: Settled factors.
+        scene: Factors of the plot, after `settle`.
         rng: Random number generator; with equal seeds for both images of a pair, so that both are degraded alike.
 
     Returns:
@@ -29,7 +29,7 @@ def degrade(image: np.ndarray, scene: Scene, rng: np.random.Generator) -> tuple[
     values = np.stack(
         [np.round(255.0 * table[:, channel]).astype(np.uint8)[image[..., channel]] for channel in range(3)], axis=2
     )
-    values = _shift_image(values, scene.motion[0] * width)
+    values = _blur_motion(values, scene.motion[0] * width)
     scale = scene.resolution[0]
     small = Image.fromarray(values).resize((max(round(scale * width), 8), max(round(scale * height), 8)), Image.Resampling.BOX)
     packed = io.BytesIO()
@@ -43,7 +43,7 @@ def degrade(image: np.ndarray, scene: Scene, rng: np.random.Generator) -> tuple[
     return values, shown
 
 
-def _shift_image(image: np.ndarray, length: float) -> np.ndarray:
+def _blur_motion(image: np.ndarray, length: float) -> np.ndarray:
     """Apply horizontal motion blur over ``length`` pixels."""
     taps = round(length) + 1
     if taps < 2:

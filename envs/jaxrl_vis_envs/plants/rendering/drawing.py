@@ -1,7 +1,7 @@
 """Renderer of fields, tile by tile: the first surface along each ray, and its colour.
 
     tables.build_view -> View -> draw: for each tile of up to 64 x 64 pixels
-        its cones, its triangles, the ground       -> depth and row of the nearest surface  `_nearest`
+        its cones, its triangles, the ground       -> depth and row of the nearest surface  `_first_hits`
         texture and light at the hit               -> colour                                `shading`
         mean over a pixel's rays                   -> radiance, instance and depth
 
@@ -33,7 +33,7 @@ _TILES_PER_BATCH = 256  # on an accelerator
 _SURFACES_PER_STEP = 8
 
 
-def draw(
+def render_view(
     view: View, shot: Shot, width: int, height: int, samples: int, batch_size: int | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Render a view.
@@ -84,20 +84,25 @@ def _joiner(tile: int, width: int, height: int):
 
 @functools.cache
 def _program(samples: int, size: int, batch_size: int, surfaces: int):
-    """Return the compiled rendering of a list of tiles."""
+    """Return the compiled function that renders a list of tiles; ``surfaces`` are tested per loop iteration."""
 
     def program(tables: Tables, shot: Shot, tiles: jax.Array, cone_ranges: jax.Array, triangle_ranges: jax.Array):
-        def one(tile: tuple[jax.Array, jax.Array, jax.Array]):
-            return _tile(tables, shot, samples, size, surfaces, *tile)
+        def render_tile(tile: tuple[jax.Array, jax.Array, jax.Array]):
+            return _render_tile(tables, shot, samples, size, surfaces, *tile)
 
-        return jax.lax.map(one, (tiles, cone_ranges, triangle_ranges), batch_size=None if batch_size == 1 else batch_size)
+        return jax.lax.map(
+            render_tile, (tiles, cone_ranges, triangle_ranges), batch_size=None if batch_size == 1 else batch_size
+        )
 
     options = compiler_options()
     options.pop("xla_cpu_use_fusion_emitters", None)
+    # XLA's default, which flags of the environment (as in the tests) may lower for programs that run for a moment. This one
+    # runs long enough for its optimisation to pay with the first image.
+    options["xla_backend_optimization_level"] = 3
     return jax.jit(program, compiler_options=options)
 
 
-def _tile(
+def _render_tile(
     tables: Tables,
     shot: Shot,
     samples: int,
@@ -114,7 +119,7 @@ def _tile(
     column, line = jnp.broadcast_arrays(column, line)
     line = line - shot.lines[0] - shot.lines[1] * (column - shot.centre[0])
     x, y = (column - shot.centre[0]) / shot.focal, (line - shot.centre[1]) / shot.focal
-    hit = _nearest(tables, shot, x, y, surfaces, cone_range, triangle_range)
+    hit = _first_hits(tables, shot, x, y, surfaces, cone_range, triangle_range)
     middle = Hit(*(part[0] for part in hit))
     if samples > 1:
         hit, x, y = Hit(*(part[1:] for part in hit)), x[1:], y[1:]
@@ -127,7 +132,7 @@ def _tile(
     return radiance, instance, jnp.where(middle.kind > 0, middle.depth, jnp.inf)
 
 
-def _nearest(
+def _first_hits(
     tables: Tables,
     shot: Shot,
     x: jax.Array,
@@ -136,7 +141,7 @@ def _nearest(
     cone_range: jax.Array,
     triangle_range: jax.Array,
 ) -> Hit:
-    """Find the first hits of rays (x, y, 1), testing ``surfaces`` surfaces per loop iteration."""
+    """Find the first hits of rays (x, y, 1) [samples, size, size], testing ``surfaces`` surfaces per loop iteration."""
     up = shot.rotation[:, 2]
     falling = x * up[0] + y * up[1] + up[2]
     ground = jnp.where(falling < -1e-6, -shot.position[2] / jnp.minimum(falling, -1e-6), FAR)

@@ -56,7 +56,7 @@ class Shot(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """Tables and lists of a `tables.View`, as arrays of JAX."""
+    """Tables and lists of a `tables.View`, as JAX arrays."""
 
     cones: jax.Array
     cone_instance: jax.Array
@@ -135,7 +135,7 @@ def _unit(vector: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
 
 
 def shade(tables: Tables, shot: Shot, x: jax.Array, y: jax.Array, hit: Hit) -> list[jax.Array]:
-    """Compute radiance towards the camera at the hits: red, green and blue."""
+    """Compute the radiance towards the camera at the hits of rays (x, y, 1) [...]: red, green and blue, [...] float32 each."""
     kind, depth = hit.kind, hit.depth
     is_cone, is_leaf, is_ground = kind == 2, kind == 3, kind == 1
     point = (x * depth, y * depth, depth)

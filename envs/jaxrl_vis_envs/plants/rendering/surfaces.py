@@ -14,9 +14,9 @@ GROUND = -2
 NOTHING = -1
 """Label where nothing is within the rendered depth."""
 OBJECT = -(1 << 20)
-"""Label of objects other than plants, such as poles."""
+"""Label of round objects other than plants, such as poles."""
 LITTER = -3
-"""Label of litter; that of the leaves of stalk n is `LITTER` - 1 - n."""
+"""Label of litter and flat objects; that of the leaves of stalk n is `LITTER` - 1 - n."""
 
 _GUTTER = 0.3
 """Height of a leaf's edges above its midrib, relative to its half width."""
@@ -65,7 +65,7 @@ class Surfaces:
     materials: np.ndarray
 
 
-def build(plot: Plot) -> Surfaces:
+def build_surfaces(plot: Plot) -> Surfaces:
     """Build the surfaces of a plot, with materials sampled from its family's textures."""
     rng = generator(plot.family, plot.seed, "textures")
     textures = plot.family.textures

@@ -75,14 +75,14 @@ def build_view(surfaces: Surfaces, pose: Pose, camera: Calibration, shift: float
     candidates = np.flatnonzero(_may_be_in_sight(surfaces.start, pose, camera))
     start, end = pose.to_camera(surfaces.start[candidates]) - offset, pose.to_camera(surfaces.end[candidates]) - offset
     reach = surfaces.radii[candidates].max(axis=1) * np.sqrt(surfaces.oval[candidates, 0]) * 1.15
-    cone_boxes = _boxes(np.stack([start, end], axis=1), reach, camera)
+    cone_boxes = _tile_boxes(np.stack([start, end], axis=1), reach, camera)
     in_sight = _in_sight(cone_boxes, columns, lines)
     cone_boxes, visible_cones = cone_boxes[in_sight], candidates[in_sight]
     cones = _cone_table(surfaces, visible_cones, start[in_sight], end[in_sight], pose)
 
     candidates = np.flatnonzero(_may_be_in_sight(surfaces.corners[:, 0], pose, camera))
     corners = pose.to_camera(surfaces.corners[candidates]) - offset
-    triangle_boxes = _boxes(corners, np.zeros(len(corners)), camera)
+    triangle_boxes = _tile_boxes(corners, np.zeros(len(corners)), camera)
     in_sight = _in_sight(triangle_boxes, columns, lines)
     in_sight[in_sight] = np.abs(np.linalg.det(corners[in_sight])) > 1e-12
     triangle_boxes, visible_triangles = triangle_boxes[in_sight], candidates[in_sight]
@@ -125,7 +125,7 @@ def _may_be_in_sight(points: np.ndarray, pose: Pose, camera: Calibration) -> np.
     return (sideways < wide * depth_bound + 0.35 + camera.baseline) & (above < high * depth_bound + 0.35)
 
 
-def _boxes(points: np.ndarray, reach: np.ndarray, camera: Calibration) -> np.ndarray:
+def _tile_boxes(points: np.ndarray, reach: np.ndarray, camera: Calibration) -> np.ndarray:
     """Return the tile ranges [N, 4] (first column and row, last column and row) that contain the spheres of radius ``reach``
     [N] about ``points`` [N, K, 3]; empty for spheres that are too near or too far.
     """

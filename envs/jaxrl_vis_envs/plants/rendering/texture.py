@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 
 def hash_words(*words: jax.Array) -> jax.Array:
-    """Hash uint32 arrays into one pseudo-random uint32 array."""
+    """Hash one to four uint32 arrays into one pseudo-random uint32 array."""
     value = jnp.uint32(0x9E3779B9)
     for word, factor in zip(words, (0x85EBCA6B, 0xC2B2AE35, 0x27D4EB2F, 0x165667B1)):
         value = (value ^ (word * jnp.uint32(factor))) * jnp.uint32(0x2545F491)
@@ -20,13 +20,13 @@ def uniform(bits: jax.Array) -> jax.Array:
 
 
 def approximate_normal(bits: jax.Array) -> jax.Array:
-    """Convert uint32 to approximately standard normal float32, within 3.4 of 0, from the sum of the four bytes."""
+    """Convert uint32 to approximately standard normal float32, within 3.5 of 0, from the sum of the four bytes."""
     total = (bits & 255) + ((bits >> 8) & 255) + ((bits >> 16) & 255) + (bits >> 24)
     return (total.astype(jnp.int32).astype(jnp.float32) - 510.0) * jnp.float32(1.0 / 147.8)
 
 
 def noise(x: jax.Array, y: jax.Array, layer: int) -> jax.Array:
-    """Evaluate smooth noise in [0, 1] with features of size 1 in both coordinates; layers are independent."""
+    """Evaluate smooth noise float32 in [0, 1) with features of size 1 in both coordinates; layers are independent."""
     column, line = jnp.floor(x), jnp.floor(y)
     u, v = x - column, y - line
     u, v = u * u * (3.0 - 2.0 * u), v * v * (3.0 - 2.0 * v)

@@ -27,7 +27,8 @@ _MIN_PIXELS = 48 * 48
 
 def _culls_per_tile(scene: Scene) -> bool:
     """Return True if objects are culled per tile; otherwise `raycast.nearest_key` tests them all."""
-    return not blocks.is_tiled(scene) and scene.height * scene.width >= _MIN_PIXELS
+    has_few = len(raycast.primitive_rows(scene, transparent=False)) <= raycast.MAX_UNROLLED
+    return has_few and not raycast.has_separate_rows(scene) and scene.height * scene.width >= _MIN_PIXELS
 
 
 def layout(scene: Scene) -> blocks.Layout:
@@ -92,6 +93,38 @@ def nearest_key(
     mask = raycast.code_mask(scene) if labelled else 0
     sky = raycast.sky_key(scene, mask)
     rows = non_plane_rows(scene)
+    object_keys = keys_of_objects(scene, unit, rows, rays, visible, object_keys, sky, mask)
+    best = jnp.broadcast_to(sky, rays.u.shape)
+    for row in raycast.primitive_rows(scene, transparent=False):
+        if row not in rows:
+            best = jnp.minimum(best, raycast.object_key(scene, unit, row, rays, sky, mask))
+    for row, key in zip(rows, object_keys, strict=True):
+        best = jnp.minimum(best, jnp.where(visible[row], key, sky))
+    return best, None, object_keys
+
+
+def keys_of_objects(
+    scene: Scene,
+    unit: shapes.UnitShapes,
+    rows: list[int],
+    rays: Rays,
+    visible: jax.Array,
+    object_keys: tuple[jax.Array, ...],
+    sky: jax.Array,
+    mask: int,
+) -> tuple[jax.Array, ...]:
+    """Compute the keys [P] int32 of each of some objects in one tile; any value unless it is ``visible`` there.
+
+    Args:
+        scene: The scene.
+        unit: Rendered objects.
+        rows: The objects, primitives.
+        rays: [P].
+        visible: [G] bool, a row of `visible_in_tiles`.
+        object_keys: Buffers [P] for the results, with any contents.
+        sky: [] int32, key where a ray misses an object.
+        mask: As in `raycast.sky_key`.
+    """
 
     def make_key_function(row: int) -> Callable[[jax.Array], jax.Array]:
         def compute(zero: jax.Array) -> jax.Array:
@@ -100,14 +133,7 @@ def nearest_key(
 
         return compute
 
-    object_keys = tuple(once(visible[row], make_key_function(row), old) for row, old in zip(rows, object_keys, strict=True))
-    best = jnp.broadcast_to(sky, rays.u.shape)
-    for row in raycast.primitive_rows(scene, transparent=False):
-        if row not in rows:
-            best = jnp.minimum(best, raycast.object_key(scene, unit, row, rays, sky, mask))
-    for row, key in zip(rows, object_keys, strict=True):
-        best = jnp.minimum(best, jnp.where(visible[row], key, sky))
-    return best, None, object_keys
+    return tuple(once(visible[row], make_key_function(row), old) for row, old in zip(rows, object_keys, strict=True))
 
 
 def once(condition: jax.Array, function: Callable[[jax.Array], jax.Array], otherwise: jax.Array) -> jax.Array:

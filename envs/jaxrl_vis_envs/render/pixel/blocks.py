@@ -147,14 +147,17 @@ class Nearest(NamedTuple):
     triangle: jax.Array | None
 
 
-def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> Nearest:
-    """Return the nearest opaque objects along rays [blocks, P]."""
-    row = None
+def nearest_primitives(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> tuple[jax.Array, jax.Array | None]:
+    """Return the keys of the nearest opaque primitives along rays [blocks, P], and their rows unless part of the keys."""
     if raycast.has_separate_rows(scene):
         bits_and_row = scan_one(lambda rays: raycast.nearest_row(scene, unit, rays), rays)
-        key, row = bits_and_row[:, 0], bits_and_row[:, 1]
-    else:
-        key = scan_one(lambda rays: raycast.nearest_key(scene, unit, rays), rays)
+        return bits_and_row[:, 0], bits_and_row[:, 1]
+    return scan_one(lambda rays: raycast.nearest_key(scene, unit, rays), rays), None
+
+
+def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> Nearest:
+    """Return the nearest opaque objects along rays [blocks, P]."""
+    key, row = nearest_primitives(scene, unit, rays)
     if not scene.clusters.shape[-2]:
         return Nearest(key, row, None)
 

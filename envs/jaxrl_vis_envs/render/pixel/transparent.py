@@ -105,7 +105,7 @@ def blend(
     films = []
     for sheet in declared:
         if sheet.hit.triangle is None:
-            film = _add_face(_clear_film(rays), *_face_colour(scene, unit, light_table, sheet, rays))
+            film = _add_face(_clear_film(rays), *face_colour(scene, unit, light_table, sheet, rays))
         else:
             film = _blend_faces(sheet.index, scene, unit, rows, light_table, rays, _max_visible_depth(depth))
         films.append(jnp.stack([*film.colour, film.transmission]))
@@ -118,16 +118,14 @@ def blend(
     return colour
 
 
-def _face_colour(
+def face_colour(
     scene: Scene, unit: shapes.UnitShapes, light_table: jax.Array, sheet: Sheet, rays: Rays
 ) -> tuple[tuple, jax.Array]:
     """Compute colour and alpha of one face, [P] each; alpha is 0 where it is not visible."""
     # Only opaque objects receive shadows.
     unshadowed = [light._replace(shadows=False) for light in lights.unpack(scene, light_table)]
     face: Any = shade.light_surface(scene, unit, unshadowed, sheet.row, sheet.hit, rays)
-    alpha = scene.rgba[scene.object_ids[sheet.index], 3]
-    if scene.object_types[sheet.index] == shapes.PLANE:
-        alpha = jnp.where(raycast.is_behind(unit, sheet.index), _PLANE_BACK * alpha, alpha)
+    alpha = alpha_of(scene, unit, sheet.index)
     image = None
     if scene.atlas.images[sheet.index] is not None:
         image = texturing.texture_colour(scene, sheet.row, sheet.hit, scene.atlas.alpha[sheet.index])
@@ -136,6 +134,14 @@ def _face_colour(
         # A plane that is transparent only from behind has an opaque material in MuJoCo; its texture's alpha applies too.
         alpha = alpha * image[3] if scene.atlas.alpha[sheet.index] else alpha
     return face, jnp.where(sheet.visible, alpha, 0.0)
+
+
+def alpha_of(scene: Scene, unit: shapes.UnitShapes, row: int) -> jax.Array:
+    """Return the alpha of an object from this side, without that of its texture: [] float32."""
+    alpha = scene.rgba[scene.object_ids[row], 3]
+    if scene.object_types[row] == shapes.PLANE:
+        alpha = jnp.where(raycast.is_behind(unit, row), _PLANE_BACK * alpha, alpha)
+    return alpha
 
 
 def _add_face(film: Film, face: tuple, alpha: jax.Array) -> Film:
@@ -178,7 +184,7 @@ def _blend_next_face(
     visible = triangle >= 0
     row = lookup.read_row(rows[index])
     hit = surface.meet(scene, row, lookup.fetch_triangle(scene, triangle), rays, jnp.where(visible, t, 1.0))
-    film = _add_face(film, *_face_colour(scene, unit, light_table, Sheet(index, row, hit, visible), rays))
+    film = _add_face(film, *face_colour(scene, unit, light_table, Sheet(index, row, hit, visible), rays))
     # Pixels without a triangle get none in later steps either.
     after = jnp.where(visible, triangle, jnp.iinfo(jnp.int32).max - 1)
     return film, triangles.next_triangle(scene, jax.lax.stop_gradient(unit), rays, depth, index, after)

@@ -5,7 +5,7 @@ and a loop runs up to that count. Under `jax.vmap` it runs up to the largest cou
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,8 @@ SEAM = 1e-5
 _OFFSET = (2e-5, -6e-6)
 # Part of a pixel by which the bounds of a cluster are rounded outwards, more than the rounding error of a large image.
 _ROUNDING = 1e-2
-_NUMBER = meshes.CLUSTER - 1  # mask of the lowest bits of a depth, which hold a triangle's index in its cluster
+NUMBER = meshes.CLUSTER - 1
+"""Mask of the lowest bits of a depth, which hold a triangle's index in its cluster."""
 
 
 class Segments(NamedTuple):
@@ -118,7 +119,7 @@ def nearest_triangle(
         assert only is not None
         candidates = _candidates(scene, unit, rays, depth, only)
     else:
-        candidates = _bounded(scene, bounds, rays, depth)
+        candidates = bounded(scene, bounds, rays, depth)
     counts = jnp.cumsum(candidates.astype(jnp.int32), dtype=jnp.int32)
     last = counts.shape[0] - 1
     far = jnp.asarray(np.inf, jnp.float32)
@@ -127,9 +128,9 @@ def nearest_triangle(
         step, best, best_index, met, cluster = state
         # The previous iteration's hit is compared only now: XLA on a CPU would otherwise recompute it for each output.
         nearer = met < best
-        number = jax.lax.bitcast_convert_type(met, jnp.int32) & _NUMBER
+        number = jax.lax.bitcast_convert_type(met, jnp.int32) & NUMBER
         best, best_index = jnp.where(nearer, met, best), jnp.where(nearer, cluster * meshes.CLUSTER + number, best_index)
-        cluster = jnp.minimum(_kth(counts, step), last)
+        cluster = jnp.minimum(kth(counts, step), last)
         met = jnp.where(step < counts[last], _intersect_cluster(scene, unit, cluster, rays), far)
         return step + 1, best, best_index, met, cluster
 
@@ -137,12 +138,19 @@ def nearest_triangle(
     start = (jnp.zeros((), jnp.int32), depth, none, jnp.full(rays.u.shape, np.inf, jnp.float32), jnp.zeros((), jnp.int32))
     # One extra iteration, to compare the last hit.
     _, best, best_index, _, _ = jax.lax.while_loop(lambda state: state[0] <= counts[last], advance, start)
-    places = scene.cluster_places.at[jnp.maximum(best_index, 0) // meshes.CLUSTER].get(mode="promise_in_bounds")
-    row = jnp.where(best_index >= 0, places[:, 1] + (best_index & _NUMBER), -1)
-    return best, row, jnp.where(best_index >= 0, places[:, 0], -1)
+    return best, *place(scene, best_index)
 
 
-def _bounded(scene: Scene, bounds: Bounds, rays: Rays, depth: jax.Array) -> jax.Array:
+def place(scene: Scene, index: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the rows in `Scene.triangles`, and those of the objects, of triangles given by their cluster times `CLUSTER` plus
+    their index in it: [P] int32 each, -1 for none.
+    """
+    places = scene.cluster_places.at[jnp.maximum(index, 0) // meshes.CLUSTER].get(mode="promise_in_bounds")
+    row = jnp.where(index >= 0, places[..., 1] + (index & NUMBER), -1)
+    return row, jnp.where(index >= 0, places[..., 0], -1)
+
+
+def bounded(scene: Scene, bounds: Bounds, rays: Rays, depth: jax.Array) -> jax.Array:
     """Return the mask [K] of clusters of opaque objects that the rays may intersect in front of ``depth``."""
     candidates = bounds.near < jnp.max(depth)
     for axis, (coordinate, pitch) in enumerate(zip(rays, camera.pixel_pitch(scene), strict=True)):
@@ -157,12 +165,12 @@ def _candidates(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Ar
     return camera.in_view(scene, middle, scene.clusters[:, 3], rays, depth) & (scene.cluster_places[:, 0] == only)
 
 
-def _kth(counts: jax.Array, step: jax.Array) -> jax.Array:
-    """Return the index of the first of the cumulative ``counts`` [K] that exceeds ``step``, K if there is none; [] int32.
+def kth(counts: jax.Array, step: jax.Array) -> jax.Array:
+    """Return the index of the first of the cumulative ``counts`` [K] that exceeds ``step``, K for none; int32, any shape.
 
     A bisection: a count of all that do not exceed it would read the whole array for every cluster.
     """
-    low, size = jnp.zeros((), jnp.int32), counts.shape[0]
+    low, size = jnp.zeros(jnp.shape(step), jnp.int32), counts.shape[0]
     for bit in reversed(range(size.bit_length())):
         probe = low + (1 << bit)
         below = counts.at[jnp.minimum(probe, size) - 1].get(mode="promise_in_bounds") <= step
@@ -197,7 +205,7 @@ def next_triangle(
 
     def advance(state: tuple) -> tuple:
         step, depths, rows = state
-        cluster = jnp.minimum(_kth(counts, step), last)
+        cluster = jnp.minimum(kth(counts, step), last)
         first = scene.cluster_places[cluster][1]
         # Clusters are in the order of their triangles: one found in an earlier cluster precedes all in this one.
         crossings = zip(
@@ -252,7 +260,7 @@ def _intersect_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array
     best = jnp.full(rays.u.shape, np.iinfo(np.int32).max, jnp.int32)
     for number, (t, margin, is_front) in enumerate(_intersect_triangles(scene, unit, cluster, rays)):
         meets = is_front & (margin >= -SEAM)
-        key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~_NUMBER) | number
+        key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~NUMBER) | number
         best = jnp.minimum(best, jnp.where(meets, key, best))
     infinite = np.float32(np.inf).view(np.int32)
     return jax.lax.bitcast_convert_type(jnp.minimum(best, infinite), jnp.float32)
@@ -274,11 +282,26 @@ def _intersect_triangles(
     # Composed maps from the camera's frame to each unit triangle: few numbers, so that a ray needs only one map.
     local_maps = jnp.sum(maps[:, :, :3, None] * axes[None, None], axis=2)
     begin = jnp.sum(maps[:, :, :3] * origin, axis=2) + maps[:, :, 3]
-    start, direction, _ = camera.ray_parts(scene, rays)
     for number in range(meshes.CLUSTER):
-        ray = camera.multiply(local_maps[number], direction)
-        offset = camera.multiply(local_maps[number], start)
-        origin_local = tuple(begin[number, axis] + offset[axis] for axis in range(3))
-        t = -origin_local[2] / jnp.where(ray[2] < 0.0, ray[2], -1.0)
-        first, second = origin_local[0] + t * ray[0], origin_local[1] + t * ray[1]
-        yield t, jnp.minimum(jnp.minimum(first, second), 1.0 - first - second), (ray[2] < 0.0) & (t > scene.znear)
+        yield cross(scene, local_maps[number], begin[number], rays)
+
+
+def cross(scene: Scene, local_map: Any, begin: Any, rays: Rays) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Intersect rays with the planes of triangles.
+
+    Args:
+        scene: The scene.
+        local_map: Linear part of the map from the camera's frame to the unit triangle: [3, 3], or three rows of values [P].
+        begin: Its constant part: [3], or three values [P].
+        rays: [P].
+
+    Returns:
+        As `_intersect_triangles`, of one triangle.
+    """
+    start, direction, _ = camera.ray_parts(scene, rays)
+    ray = camera.multiply(local_map, direction)
+    offset = camera.multiply(local_map, start)
+    origin = tuple(begin[axis] + offset[axis] for axis in range(3))
+    t = -origin[2] / jnp.where(ray[2] < 0.0, ray[2], -1.0)
+    first, second = origin[0] + t * ray[0], origin[1] + t * ray[1]
+    return t, jnp.minimum(jnp.minimum(first, second), 1.0 - first - second), (ray[2] < 0.0) & (t > scene.znear)

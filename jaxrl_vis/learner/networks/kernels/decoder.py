@@ -29,11 +29,11 @@ from jax.experimental.pallas import triton as plgpu
 from jaxrl_vis.learner.networks import forward_mode
 from jaxrl_vis.learner.networks.kernels.passes import (
     MIN_ROWS,
-    before,
     dispatch,
     dot,
     layer,
-    rectified,
+    rectifier_gradient,
+    relu,
     rows,
     tiles_of_program,
     whole_block,
@@ -48,6 +48,8 @@ _CELLS, _TILES, _PARAMS = 64, 32, plgpu.CompilerParams(num_warps=4, num_stages=1
 
 class Weights(NamedTuple):
     """Weights of the layers in the layout that the kernel multiplies, float32.
+
+    F is the number of features of a cell, G that of a quarter of it, and C' that of channels padded to a power of two.
 
     Attributes:
         bias_in: [F], added to cells before their rectifier.
@@ -65,7 +67,13 @@ class Weights(NamedTuple):
 
 
 def supports(channels: int, cell_features: int, quarter_features: int) -> bool:
-    """Return True if the kernel supports decoders of images with these channels, and layers of these sizes."""
+    """Return True if the kernel supports decoders of images with ``channels`` channels and these feature counts.
+
+    Args:
+        channels: C, of the images.
+        cell_features: F, features of a cell of 4x4 pixels.
+        quarter_features: G, features of a quarter of a cell.
+    """
     powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in (cell_features, 4 * quarter_features))
     return channels <= _MAX_CHANNELS and powers
 
@@ -102,9 +110,9 @@ def _cast(weights: Weights, dtype: Any) -> Weights:
 
 
 def _forward(cells: jax.Array, weights: Weights) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Compute the rectified cells and the layer above them, in the dtype of ``cells``, and the pixels in float32."""
+    """Compute rectified cells [R, F] and the next layer [R, 4 G] in the dtype of ``cells``, and pixels [R, 16 C'] float32."""
     dtype = cells.dtype
-    hidden = rectified(cells.astype(jnp.float32) + weights.bias_in[None, :]).astype(dtype)
+    hidden = relu(cells.astype(jnp.float32) + weights.bias_in[None, :]).astype(dtype)
     finer = layer(hidden, weights.kernel_1, weights.bias_1)
     return hidden, finer, dot(finer, weights.kernel_2) + weights.bias_2[None, :]
 
@@ -113,18 +121,18 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
     weights, (gradient_ref, sums_ref) = Weights(*(ref[...] for ref in refs[:-2])), refs[-2:]
 
     def add_rows(values):
-        """As in `kernels.passes`."""
+        """Sum over rows, repeated in every row of the result, as in `kernels.passes`."""
         return dot(jnp.ones((MIN_ROWS, values.shape[0]), values.dtype), values)
 
-    def one_tile(number, carry):
+    def process_tile(number, carry):
         sums, squares = carry
         here = pl.ds(number * tile, tile)
         hidden, finer, pixels = _forward(cells_ref[here, :], weights)
         error = pixels - target_ref[here, :].astype(jnp.float32)
         squares += jnp.sum(error * error, axis=0)
         before_2 = (2.0 * scale * error).astype(hidden.dtype)
-        before_1 = before(finer, dot(before_2, weights.kernel_2, (1, 1)))
-        before_in = before(hidden, dot(before_1, weights.kernel_1, (1, 1)))
+        before_1 = rectifier_gradient(finer, dot(before_2, weights.kernel_2, (1, 1)))
+        before_in = rectifier_gradient(hidden, dot(before_1, weights.kernel_1, (1, 1)))
         gradient_ref[here, :] = before_in
         sums = Weights(
             sums.bias_in + add_rows(before_in),
@@ -137,7 +145,7 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
 
     zeros = [jnp.zeros(value.shape if value.ndim > 1 else (MIN_ROWS, value.shape[0]), jnp.float32) for value in weights]
     start = Weights(*zeros), jnp.zeros(weights.bias_2.shape, jnp.float32)
-    sums, squares = jax.lax.fori_loop(0, cells_ref.shape[0] // tile, one_tile, start)
+    sums, squares = jax.lax.fori_loop(0, cells_ref.shape[0] // tile, process_tile, start)
     first = 0
     for like, value in zip((*weights, weights.bias_2), (*sums, squares), strict=True):
         if value.shape != like.shape:  # sixteen copies of the same sum
@@ -149,7 +157,7 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
 def _squared_error_on_gpu(
     cells: jax.Array, target: jax.Array, weights: Weights, scale: float, interpret: bool = False
 ) -> tuple[jax.Array, jax.Array, Weights]:
-    """Compute the scaled sum of squared errors, and its gradients with respect to cells and weights."""
+    """Compute the scaled sum of squared errors [], and its gradients with respect to cells and weights; see `squared_error`."""
     count, features = cells.shape
     tile = divisor(count, _CELLS)
     block = tile * tiles_of_program(count // tile, count // tile, _TILES)
@@ -216,13 +224,13 @@ def squared_error(cells: jax.Array, target: jax.Array, weights: Weights, scale: 
         target: [at least M, 16 C'], of which the first M rows are used; padding must be 0.
         weights: From `make_weights`.
         scale: Python number, so that the kernel writes the scaled gradient directly.
-        interpret: Run the kernel without a GPU, slowly.
+        interpret: Whether to interpret the kernel without a GPU, which is slow.
 
     Raises:
         ValueError: M is not a multiple of 16.
     """
     if cells.shape[0] % MIN_ROWS:
         raise ValueError(f"{cells.shape[0]} cells are not a multiple of {MIN_ROWS}")
-    if forward_mode.are_wanted():
+    if forward_mode.is_active():
         return _plain_squared_error(cells, target, weights, scale)
     return _squared_error(cells, target, weights, scale, interpret)

@@ -37,7 +37,7 @@ _MAX_CHANNELS = 16
 
 
 def supports(filters: tuple[int, ...], shape: tuple[int, ...]) -> bool:
-    """Return True if the kernel supports encoders with these output channels, and images [C, H, W] of this shape."""
+    """Return True if the kernel supports encoders with these output channels by layer, and images of this shape [C, H, W]."""
     powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in filters[:LEVELS])
     return len(filters) >= LEVELS and powers and shape[0] <= _MAX_CHANNELS
 
@@ -81,7 +81,7 @@ def prepare(
         dtype: Dtype of the result.
         shift: [B, 2] int32, pixels by which to shift normalised images down and to the right, filling with 0; None for no
             shift.
-        interpret: Run the kernel without a GPU, slowly.
+        interpret: Whether to interpret the kernel without a GPU, which is slow.
     """
     settings = {"levels": levels, "limit": limit, "dtype": dtype}
     on_gpu = functools.partial(prepare_on_gpu, **settings, interpret=interpret)
@@ -92,7 +92,7 @@ def prepare(
 
 
 def encode(patches: jax.Array, weights: Weights, which: slice = slice(None), interpret: bool = False) -> jax.Array:
-    """Encode the images ``which`` by `apply`: [B, patches, 64 C'] -> [images, patches, F], same dtype.
+    """Encode the images ``which`` by `apply`: [B, patches, 64 C'] -> [images, patches, F], same dtype; ``interpret`` as there.
 
     Images are selected here rather than sliced beforehand, because passing a slice to a kernel would copy it.
     """
@@ -103,6 +103,6 @@ def encode(patches: jax.Array, weights: Weights, which: slice = slice(None), int
     if math.gcd(first, count) % TILE:  # a few small images
         patches = jnp.pad(patches[which], ((0, -len(images) % TILE), (0, 0), (0, 0)))
         first, rows = 0, patches.shape[0] * of_image
-    chosen = apply_forwards if forward_mode.are_wanted() else apply
+    chosen = apply_forwards if forward_mode.is_active() else apply
     out: jax.Array = chosen(patches.reshape(-1, size), weights, first, rows, interpret)  # type: ignore[assignment]
     return out[:count].reshape(-1, of_image, out.shape[-1])

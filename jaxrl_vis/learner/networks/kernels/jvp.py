@@ -18,13 +18,13 @@ from jaxrl_vis.learner.networks.kernels.passes import (
     apply,
     apply_plain,
     as_quarters,
-    before,
     cast_kernels,
     dispatch,
     dot,
-    joined,
     layer,
-    read,
+    layer_inputs,
+    load_weights,
+    rectifier_gradient,
     rows,
     tile_quarters,
     tile_rows,
@@ -36,17 +36,17 @@ from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 def _tangent_kernel(x_ref, *refs):
     inputs, (out_ref, tangent_ref) = refs[:-2], refs[-2:]
-    weights, tangent_weights = read(inputs[: len(inputs) // 2]), read(inputs[len(inputs) // 2 :])
+    weights, tangent_weights = load_weights(inputs[: len(inputs) // 2]), load_weights(inputs[len(inputs) // 2 :])
 
-    def one_tile(tile, _):
+    def process_tile(tile, _):
         values, tangents = x_ref[tile_quarters(tile), :], None
         for level, parameters in enumerate(zip(*weights, *tangent_weights, strict=True)):
-            tangents = None if tangents is None else joined(tangents, level)
-            values, tangents = _layer_jvp(joined(values, level), tangents, *parameters)
+            tangents = None if tangents is None else layer_inputs(tangents, level)
+            values, tangents = _layer_jvp(layer_inputs(values, level), tangents, *parameters)
         assert tangents is not None  # there is a layer
         out_ref[tile_rows(tile), :], tangent_ref[tile_rows(tile), :] = values, tangents
 
-    jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
+    jax.lax.fori_loop(0, out_ref.shape[0] // TILE, process_tile, None)
 
 
 def _layer_jvp(
@@ -61,22 +61,22 @@ def _layer_jvp(
     out, change = layer(values, kernel, bias), dot(values, kernel_along) + bias_along[None, :]
     if tangents is not None:
         change += dot(tangents, kernel)
-    return out, before(out, change)
+    return out, rectifier_gradient(out, change)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4))
 def apply_forwards(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
-    """Compute `apply`, differentiable in forward mode with respect to the weights."""
+    """Compute `apply`, with the same arguments, but differentiable in forward mode with respect to the weights."""
     return apply(patches, weights, first, count, interpret)
 
 
 @apply_forwards.defjvp
 def _apply_along(first: int, count: int, interpret: bool, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     patches, weights = primals
-    place = {"first": first, "count": count}
-    on_gpu = functools.partial(_gpu_jvp, **place, interpret=interpret)
-    plainly = functools.partial(_plain_jvp, **place)
-    return dispatch(on_gpu, plainly, patches, weights, tangents[1], interpret=interpret)
+    rows = {"first": first, "count": count}
+    on_gpu = functools.partial(_gpu_jvp, **rows, interpret=interpret)
+    plain = functools.partial(_plain_jvp, **rows)
+    return dispatch(on_gpu, plain, patches, weights, tangents[1], interpret=interpret)
 
 
 def _gpu_jvp(

@@ -1,4 +1,4 @@
-"""Forward and backward GPU kernels of the encoder's first layers, see `kernels.encoder`; the third kernel is in `kernels.jvp`.
+"""Forward and backward GPU kernels of the encoder's first layers, see `kernels.encoder`; that of tangents is in `kernels.jvp`.
 
 Each has an equivalent in plain JAX, as a reference and for processes without a GPU that runs the kernels.
 """
@@ -20,7 +20,7 @@ from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 MIN_ROWS = 16
 """Minimum number of rows of a product in a kernel."""
 TILE = 16
-"""Patches in a tile."""
+"""Number of patches in a tile."""
 # Tuned on an H200: number of tiles per program (a maximum in the backward pass), and compiler parameters.
 FORWARD_TILES, FORWARD = 8, plgpu.CompilerParams(num_warps=4, num_stages=3)
 _BACKWARD_TILES, _BACKWARD = 64, plgpu.CompilerParams(num_warps=4, num_stages=1)
@@ -54,28 +54,31 @@ def is_available() -> bool:
 
 
 def probe() -> None:
-    """Compile small instances of all three kernels for the default device; raise any error of the compilation."""
+    """Compile small instances of three kernels for the default device: preparation, forward and backward pass.
+
+    Any error of the compilation is raised.
+    """
     probe_program().lower().compile()
 
 
 def probe_program() -> Any:
-    """Trace small instances of all three kernels in one program (`jax.stages.Traced`)."""
+    """Trace small instances of the three kernels of `probe` in one program (`jax.stages.Traced`)."""
     shape, levels = (4, 16, 16), LEVELS + 1
     images, of_pixels = jnp.zeros((MIN_ROWS, *shape), jnp.uint8), jnp.zeros(shape)
     sizes = (64, 64), (64, 16), (64, 16)
     weights = Weights(tuple(map(jnp.zeros, sizes)), tuple(jnp.zeros(columns) for _, columns in sizes))
 
-    def all_three(images: jax.Array, mean: jax.Array, scale: jax.Array, weights: Weights) -> Weights:
+    def run_kernels(images: jax.Array, mean: jax.Array, scale: jax.Array, weights: Weights) -> Weights:
         patches = prepare_on_gpu(images, mean, scale, None, levels, 5.0, jnp.bfloat16)
         patches = patches.reshape(-1, patches.shape[-1])
         out = _apply_on_gpu(patches, weights, 0, patches.shape[0])
         return _gpu_backward(patches, weights, out, out, 0, patches.shape[0])
 
-    return jax.jit(all_three).trace(images, of_pixels, of_pixels, weights)
+    return jax.jit(run_kernels).trace(images, of_pixels, of_pixels, weights)
 
 
 def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
-    """Call the kernel if the program is compiled for a GPU that runs it, else its equivalent in plain JAX."""
+    """Call the kernel if the program is compiled for a GPU that runs it, or interpreted, else its equivalent in plain JAX."""
     if interpret:
         return on_gpu(*arguments)
     return dispatch_by_platform(lambda *args: (on_gpu if use_gpu_kernels(probe) else plain)(*args), *arguments)
@@ -85,53 +88,53 @@ def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
 
 
 def dot(left: jax.Array, right: jax.Array, contract: tuple[int, int] = (1, 0)) -> jax.Array:
-    """Multiply matrices in float32, contracting axis ``contract[0]`` of the left with ``contract[1]`` of the right."""
+    """Multiply matrices, contracting axis ``contract[0]`` of the left with ``contract[1]`` of the right; return float32."""
     dimensions = (((contract[0],), (contract[1],)), ((), ()))
     return jax.lax.dot_general(left, right, dimensions, preferred_element_type=jnp.float32)
 
 
 def layer(values: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
-    """Apply a dense layer with rectifier, in the dtype of ``values``."""
-    return rectified(dot(values, kernel) + bias[None, :]).astype(values.dtype)
+    """Apply a dense layer with rectifier: [R, inputs] -> [R, outputs], in the dtype of ``values``."""
+    return relu(dot(values, kernel) + bias[None, :]).astype(values.dtype)
 
 
-def rectified(values: jax.Array) -> jax.Array:
-    """Rectify, with gradient 0 at 0 like `jax.nn.relu` and unlike `jnp.maximum`, because blank image regions are exactly 0."""
+def relu(values: jax.Array) -> jax.Array:
+    """Apply a ReLU, with gradient 0 at 0 like `jax.nn.relu` and unlike `jnp.maximum`: blank image regions are exactly 0."""
     return jnp.where(values > 0.0, values, 0.0)
 
 
-def before(after: jax.Array, gradient: jax.Array) -> jax.Array:
-    """Propagate a gradient back through a rectifier with output ``after``, in its dtype."""
-    return jnp.where(after > 0.0, gradient, 0.0).astype(after.dtype)
+def rectifier_gradient(output: jax.Array, gradient: jax.Array) -> jax.Array:
+    """Multiply a gradient, or a tangent, by the derivative of a rectifier with output ``output``, in its dtype."""
+    return jnp.where(output > 0.0, gradient, 0.0).astype(output.dtype)
 
 
 def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
-    """Return the output of each layer for quarters of patches [4 R, 16 C']; see `joined` for their rows."""
+    """Return the output of each layer for quarters of patches [4 R, 16 C']; see `layer_inputs` for their rows."""
     outputs, values = [], quarters
     for level, (kernel, bias) in enumerate(zip(*weights, strict=True)):
-        values = layer(joined(values, level), kernel, bias)
+        values = layer(layer_inputs(values, level), kernel, bias)
         outputs.append(values)
     return outputs
 
 
-def joined(values: jax.Array, level: int) -> jax.Array:
-    """Return the rows that a layer multiplies: four quarters side by side for the third layer, else the previous output."""
+def layer_inputs(values: jax.Array, level: int) -> jax.Array:
+    """Return the rows that layer ``level`` multiplies: four quarters side by side for the last of them, else unchanged."""
     return values.reshape(values.shape[0] // 4, -1) if level == LEVELS - 1 else values
 
 
-def read(refs: Any) -> Weights:
+def load_weights(refs: Any) -> Weights:
     """Load the weights from a kernel's arguments: kernels, then biases."""
     values = tuple(ref[...] for ref in refs)
     return Weights(values[: len(values) // 2], values[len(values) // 2 :])
 
 
 def _forward_kernel(x_ref, *refs):
-    weights, out_ref = read(refs[:-1]), refs[-1]
+    weights, out_ref = load_weights(refs[:-1]), refs[-1]
 
-    def one_tile(tile, _):
+    def process_tile(tile, _):
         *_, out_ref[tile_rows(tile), :] = _layers(x_ref[tile_quarters(tile), :], weights)
 
-    jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
+    jax.lax.fori_loop(0, out_ref.shape[0] // TILE, process_tile, None)
 
 
 def tile_rows(tile: Any) -> Any:
@@ -145,20 +148,20 @@ def tile_quarters(tile: Any) -> Any:
 
 
 def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
-    weights, sums_ref = read(refs[:-1]), refs[-1]
+    weights, sums_ref = load_weights(refs[:-1]), refs[-1]
     hidden_layers = Weights(weights.kernels[:-1], weights.biases[:-1])
 
     def add_rows(values):
         """Sum over rows, repeated in every row of the result: as a matrix product, this takes half the time of a reduction."""
         return dot(jnp.ones((MIN_ROWS, values.shape[0]), values.dtype), values)
 
-    def one_tile(tile, sums):
+    def process_tile(tile, sums):
         values = [x_ref[tile_quarters(tile), :]]
         values += [*_layers(values[0], hidden_layers), out_ref[tile_rows(tile), :]]
         gradient, of_kernels, of_biases = gradient_ref[tile_rows(tile), :], list(sums.kernels), list(sums.biases)
         for level in reversed(range(LEVELS)):
-            gradient = before(values[level + 1], gradient)
-            of_kernels[level] += dot(joined(values[level], level), gradient, (0, 0))
+            gradient = rectifier_gradient(values[level + 1], gradient)
+            of_kernels[level] += dot(layer_inputs(values[level], level), gradient, (0, 0))
             of_biases[level] += add_rows(gradient)
             if level:
                 gradient = dot(gradient, weights.kernels[level], (1, 1)).reshape(values[level].shape)
@@ -168,7 +171,7 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
         tuple(jnp.zeros(kernel.shape, jnp.float32) for kernel in weights.kernels),
         tuple(jnp.zeros((MIN_ROWS, bias.shape[0]), jnp.float32) for bias in weights.biases),
     )
-    sums, first = jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, start), 0
+    sums, first = jax.lax.fori_loop(0, out_ref.shape[0] // TILE, process_tile, start), 0
     # Sums of biases are sixteen copies of the same row.
     for value in (*sums.kernels, *(jnp.sum(value, axis=0) * (1.0 / MIN_ROWS) for value in sums.biases)):
         sums_ref[pl.ds(first, value.size)] = value.reshape(-1)
@@ -214,7 +217,7 @@ def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpre
         patches: [M, 64 C'] from `prepare`.
         weights: From `make_weights`.
         first, count: Index of the first patch, and number of patches; both multiples of `TILE`.
-        interpret: Run the kernel without a GPU, slowly.
+        interpret: Whether to interpret the kernel without a GPU, which is slow.
     """
     place = {"first": first, "count": count}
     on_gpu = functools.partial(_apply_on_gpu, **place, interpret=interpret)
@@ -266,7 +269,7 @@ def _apply_backward(first: int, count: int, interpret: bool, residuals: Any, gra
 def _gpu_backward(
     patches: jax.Array, weights: Weights, out: jax.Array, gradient: jax.Array, first: int, count: int, interpret: bool = False
 ) -> Weights:
-    """Compute the gradients of the weights, float32."""
+    """Compute the gradients with respect to the weights, float32, from the result ``out`` of `apply` and its gradient."""
     outputs = out.shape[1]
     block = TILE * tiles_of_program(math.gcd(first, count) // TILE, count // TILE, _BACKWARD_TILES)
     programs = count // block

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
-from jaxrl_vis.learner.networks.blocks import shifted
+from jaxrl_vis.learner.networks.blocks import shift_images
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 LEVELS = 3
@@ -24,12 +24,12 @@ _PREPARE_NUMBERS, _PREPARE_IMAGES, _PREPARE = 4096, 16, plgpu.CompilerParams(num
 
 
 def padded_channels(channels: int) -> int:
-    """Return C', the next power of two."""
+    """Return C', the smallest power of two that is not less than ``channels``."""
     return pl.next_power_of_2(channels)
 
 
 def divisor(number: int, limit: int) -> int:
-    """Return the largest power of two that divides ``number``, at most ``limit``."""
+    """Return the largest power of two up to ``limit`` that divides ``number``; ``limit`` must be a power of two."""
     return math.gcd(number, limit)
 
 
@@ -54,25 +54,25 @@ def _prepare_kernel(images_ref, mean_ref, scale_ref, *refs, shape, levels, limit
     halves = [axis for level in range(finer + 1) for axis in (1 + level, finer + 4 + level)]
     order = (finer + 3, *halves, 0, finer + 2, 2 * finer + 5)
 
-    def statistics(pixel: jax.Array, there: jax.Array) -> list[jax.Array]:
-        return [plgpu.load(ref.at[pixel], mask=there, other=0.0) for ref in (mean_ref, scale_ref)]
+    def statistics(pixel: jax.Array, mask: jax.Array) -> list[jax.Array]:
+        return [plgpu.load(ref.at[pixel], mask=mask, other=0.0) for ref in (mean_ref, scale_ref)]
 
-    pixel, there = (channel * height + row) * width + column, channel < channels
-    still = [pixel, there, *statistics(pixel, there)]
+    pixel, is_channel = (channel * height + row) * width + column, channel < channels
+    still = [pixel, is_channel, *statistics(pixel, is_channel)]
 
-    def one_image(image, _):
+    def prepare_image(image, _):
         places = still
         if moves:
             from_row, from_column = row - moves[0][image, 0], column - moves[0][image, 1]
-            inside = (from_row >= 0) & (from_row < height) & (from_column >= 0) & (from_column < width) & there
+            is_inside = (from_row >= 0) & (from_row < height) & (from_column >= 0) & (from_column < width) & is_channel
             pixel = (channel * height + from_row) * width + from_column
-            places = [pixel, inside, *statistics(pixel, inside)]
-        pixel, inside, mean, scale = places
-        values = plgpu.load(images_ref.at[image, pixel], mask=inside, other=0).astype(jnp.float32)
+            places = [pixel, is_inside, *statistics(pixel, is_inside)]
+        pixel, is_inside, mean, scale = places
+        values = plgpu.load(images_ref.at[image, pixel], mask=is_inside, other=0).astype(jnp.float32)
         values = jnp.clip((values - mean) * scale, -limit, limit).astype(out_ref.dtype)
         out_ref[image] = values.reshape(parts).transpose(order).reshape(patches, size)
 
-    jax.lax.fori_loop(0, images, one_image, None)
+    jax.lax.fori_loop(0, images, prepare_image, None)
 
 
 def prepare_on_gpu(
@@ -85,7 +85,7 @@ def prepare_on_gpu(
     dtype: Any,
     interpret: bool = False,
 ) -> jax.Array:
-    """Compute `kernels.encoder.prepare` with the GPU kernel; ``interpret`` runs it without a GPU, slowly."""
+    """Compute `kernels.encoder.prepare` with the GPU kernel; ``interpret`` interprets it without a GPU, which is slow."""
     batch, *shape = images.shape
     channels, height, width = shape
     rows, columns, of_block = height >> levels, width >> levels, 4 ** (levels - LEVELS)
@@ -116,7 +116,7 @@ def prepare_plain(
     """Compute `kernels.encoder.prepare` in plain JAX."""
     if shift is not None:
         values = jnp.clip((images.astype(jnp.float32) - mean) * scale, -limit, limit).astype(dtype)
-        return to_patches(shifted(values, shift), levels)
+        return to_patches(shift_images(values, shift), levels)
     patches, mean, scale = (to_patches(array, levels) for array in (images, mean, scale))
     return jnp.clip((patches.astype(jnp.float32) - mean) * scale, -limit, limit).astype(dtype)
 

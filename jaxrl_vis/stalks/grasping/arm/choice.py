@@ -13,12 +13,12 @@ import numpy as np
 from jaxrl_vis.stalks.grasping.arm import approach
 from jaxrl_vis.stalks.grasping.perception.lines import HEIGHTS, GraspPoint
 
-MIN_ROOM = 0.0045
+MIN_CLEARANCE = 0.0045
 """Minimum room beside the open gripper on its whole path, m, below which the arm is not sent."""
-_ENOUGH_ROOM = 0.02  # m: more room is no better
+_SUFFICIENT_CLEARANCE = 0.02  # m: more room is no better
 _STEPS = tuple(sign * step for step in np.arange(0.0, 0.31, 0.05) for sign in (-1.0, 1.0))
 # m, candidate heights relative to the grasp point: farther away, the line is not reliable
-_UNSURE = 0.005  # m per m: penalty on the room for the distance from the height of the grasp point
+_HEIGHT_PENALTY = 0.005  # m per m: penalty on the room for the distance from the height of the grasp point
 _USUAL_RADIUS = 0.007  # m: radius of stalks of unknown thickness
 
 
@@ -39,17 +39,22 @@ class Choice(NamedTuple):
 
     @property
     def is_blocked(self) -> bool:
-        """True if the stalk is within reach, but other stalks leave less than `MIN_ROOM`."""
-        return self.stop >= 0 and self.room < MIN_ROOM
+        """True if the stalk is within reach, but other stalks leave less than `MIN_CLEARANCE`."""
+        return self.stop >= 0 and self.room < MIN_CLEARANCE
 
 
-def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float, float] = HEIGHTS) -> list[Choice]:
-    """Choose an approach to each of the detected stalks.
+def choose_approaches(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float, float] = HEIGHTS) -> list[Choice]:
+    """Choose an approach to each of the detected stalks, by maximum room at heights up to 0.3 m from the grasp point.
+
+    Room beyond 20 mm counts no more, and 5 mm of room are deducted for each metre from the height of the grasp point.
 
     Args:
         points: Grasp points, in one robot frame.
         stops: [S, 3], `Stands.origin` of each possible stop, in the same frame, m.
         heights: Minimum and maximum height of a grasp, m above the ground.
+
+    Returns:
+        One choice for each point, in order; with stop -1 and the grasp point itself for points that are out of reach.
     """
     chosen = []
     for point in points:
@@ -59,7 +64,7 @@ def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float
             path = _approach_at(point, points, stops, height)
             if path.stop < 0:
                 continue
-            value = min(path.room, _ENOUGH_ROOM) - _UNSURE * abs(height - point.point[2])
+            value = min(path.room, _SUFFICIENT_CLEARANCE) - _HEIGHT_PENALTY * abs(height - point.point[2])
             if value > worth:
                 best, worth = Choice(path.stop, path.side, path.room, point.at_height(height)), value
         chosen.append(best)
@@ -70,7 +75,10 @@ def choose_nearest(points: Sequence[GraspPoint], stops: np.ndarray, heights: tup
     """Choose the stop nearest to each stalk along the row, and the height of its grasp point, clipped to ``heights``.
 
     Args:
-        points, stops, heights: See `choose`.
+        points, stops, heights: See `choose_approaches`.
+
+    Returns:
+        One choice for each point, in order; its stop is -1 if the point is out of reach from the nearest stop.
     """
     chosen = []
     for point in points:
@@ -87,12 +95,12 @@ def _approach_at(point: GraspPoint, points: Sequence[GraspPoint], stops: np.ndar
     others = [other for other in points if other is not point]
     other_points = np.array([other.at_height(height) for other in others]).reshape(-1, 3)
     return approach.best_approach(
-        stops, point.at_height(height), other_points[:, :2], stalk_radii(others, height), _ENOUGH_ROOM
+        stops, point.at_height(height), other_points[:, :2], stalk_radii(others, height), _SUFFICIENT_CLEARANCE
     )
 
 
 def stalk_radii(points: Sequence[GraspPoint], height: float | None = None) -> np.ndarray:
-    """Return the radii [B] of stalks, m; a default for unknown thickness.
+    """Return the radii [B] of stalks as float64, m; 7 mm for stalks of unknown thickness.
 
     Args:
         points: Grasp points of B stalks.

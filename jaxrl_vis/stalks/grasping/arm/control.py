@@ -31,7 +31,7 @@ class Timing:
     """Movement of the slide and turn of the folded arm."""
     extend: float = 1.0
     """Movement of the grip outwards along the line."""
-    refine_edges: float = 0.2
+    settle: float = 0.2
     """Settling of the controllers at the target."""
     close: float = 0.4
     """Closing of the jaws."""
@@ -39,7 +39,7 @@ class Timing:
     @property
     def reach(self) -> float:
         """Duration until the jaws begin to close, s."""
-        return self.turn + self.extend + self.refine_edges
+        return self.turn + self.extend + self.settle
 
 
 class Gains(NamedTuple):
@@ -58,11 +58,11 @@ class Gains(NamedTuple):
     jaw_force: float = 10.0  # N
 
 
-class Drive(NamedTuple):
+class ControllerState(NamedTuple):
     """State of the controllers.
 
     Attributes:
-        integral: [3] float32, integrated errors of slide, shoulder and elbow, m s and rad s.
+        integral: [3] float32, integrated errors of slide, shoulder and elbow, m s and rad s, clipped to -0.05 to 0.05.
         motor: [2] float32, angles of the motors behind the springs of shoulder and elbow, rad.
         error: [2] float32, last errors of shoulder and elbow, rad.
     """
@@ -72,8 +72,8 @@ class Drive(NamedTuple):
     error: jax.Array
 
 
-def smooth(fraction: Any) -> Any:
-    """Return the fraction of a minimum-jerk movement done after a ``fraction`` of its time, clipped to 0 to 1."""
+def minimum_jerk(fraction: Any) -> Any:
+    """Return the fraction of a minimum-jerk movement that is completed after a ``fraction`` of its time, clipped to 0 to 1."""
     fraction = jnp.clip(fraction, 0.0, 1.0)
     return fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2)
 
@@ -98,23 +98,25 @@ def plan_movement(target: jax.Array, start: jax.Array, time: Any, timing: Timing
         timing: Durations of the phases of the reach.
     """
     shoulder = jnp.asarray(stalk_arm.SHOULDER, jnp.float32)
-    turned = smooth(time / timing.turn)
-    extended = smooth((time - timing.turn) / timing.extend)
+    turned = minimum_jerk(time / timing.turn)
+    extended = minimum_jerk((time - timing.turn) / timing.extend)
     bearings = [jnp.arctan2(-(place - shoulder)[0], (place - shoulder)[1]) for place in (start[:2], target[:2])]
     radii = [jnp.linalg.norm(place - shoulder) for place in (start[:2], target[:2])]
     bearing = bearings[0] + turned * (bearings[1] - bearings[0])
-    fold_replay = radii[0] + turned * (FOLDED - radii[0])
-    radius = fold_replay + extended * (radii[1] - FOLDED)
+    folded_radius = radii[0] + turned * (FOLDED - radii[0])
+    radius = folded_radius + extended * (radii[1] - FOLDED)
     height = start[2] + turned * (target[2] - start[2])
     return jnp.stack([shoulder[0] - radius * jnp.sin(bearing), shoulder[1] + radius * jnp.cos(bearing), height])
 
 
-def start_drive(joints: jax.Array) -> Drive:
+def init_controllers(joints: jax.Array) -> ControllerState:
     """Return the initial state of the controllers for an arm at rest at ``joints`` [3]: slide, shoulder, elbow (m, rad)."""
-    return Drive(jnp.zeros(3, jnp.float32), joints[1:3], jnp.zeros(2, jnp.float32))
+    return ControllerState(jnp.zeros(3, jnp.float32), joints[1:3], jnp.zeros(2, jnp.float32))
 
 
-def drive(state: Drive, joints: jax.Array, velocity: jax.Array, targets: jax.Array, gains: Gains) -> tuple[Drive, jax.Array]:
+def step_controllers(
+    state: ControllerState, joints: jax.Array, velocity: jax.Array, targets: jax.Array, gains: Gains
+) -> tuple[ControllerState, jax.Array]:
     """Advance the controllers by one period.
 
     Args:
@@ -125,7 +127,7 @@ def drive(state: Drive, joints: jax.Array, velocity: jax.Array, targets: jax.Arr
         gains: Gains of the controllers.
 
     Returns:
-        The new state, and the generalised forces [3] on the joints, N and N m.
+        The new state, and the generalised forces [3] float32 on slide, shoulder and elbow, N and N m.
     """
     period = 1.0 / RATE
     error = targets - joints
@@ -139,4 +141,4 @@ def drive(state: Drive, joints: jax.Array, velocity: jax.Array, targets: jax.Arr
     torque = jnp.clip(spring * (motor - joints[1:]), -max_torque, max_torque)
     speed = gains.slide_proportional * error[0] + gains.slide_integral * integral[0]
     force = gains.slide_drive * (jnp.clip(speed, -gains.slide_speed, gains.slide_speed) - velocity[0])
-    return Drive(integral, motor, error[1:]), jnp.concatenate([force[None], torque])
+    return ControllerState(integral, motor, error[1:]), jnp.concatenate([force[None], torque])

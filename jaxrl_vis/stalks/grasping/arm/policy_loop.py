@@ -19,14 +19,14 @@ from jaxrl_vis.run.trained.policy import Policy
 from jaxrl_vis.stalks.grasping.arm import control
 from jaxrl_vis.stalks.grasping.arm.approach import reachable
 from jaxrl_vis.stalks.grasping.arm.control import Gains, Timing
-from jaxrl_vis.stalks.grasping.arm.reach import Reaching, ReachResult, Scene, arms_among, begin, held_stalks, period
+from jaxrl_vis.stalks.grasping.arm.reach import Reaching, ReachResult, Scene, begin, build_arm_model, held_stalks, step_control
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.pixels import ImageObserver
 from jaxrl_vis_envs.plants import bending
 from jaxrl_vis_envs.plants.bending import Shape
 from jaxrl_vis_envs.plants.stand import Stands
 from jaxrl_vis_envs.tasks import stalk_arm
-from jaxrl_vis_envs.tasks.stalk_reach import HOME, StalkReach, within_reach
+from jaxrl_vis_envs.tasks.stalk_reach import HOME, StalkReach, clamp_to_workspace
 
 STALKS = 4
 """Number of stalks in a stand, the default of the task."""
@@ -42,11 +42,11 @@ def check_policy(policy: Policy) -> None:
         raise RequestError(f"--policy must see single images: its run has frame_stack {policy.env.frame_stack}")
 
 
-class _Moving(NamedTuple):
+class _LoopState(NamedTuple):
     """State of an arm during a reach, and setpoint [3] of its grip, m in the frame of the stand."""
 
     reaching: Reaching
-    place: jax.Array
+    setpoint: jax.Array
 
 
 def reach_by_policy(
@@ -76,7 +76,7 @@ def reach_by_policy(
     local = np.where(can[:, None], targets - stands.origin, np.array(HOME))[fill].astype(np.float32)
     shapes = [jax.tree.map(lambda part: jnp.asarray(part[fill]), bending.shapes(stalks)) for stalks in (stands, detected)]
     winds = jnp.full(len(fill), wind_mm / 1000, jnp.float32)
-    draw, episode = _programs(policy)
+    draw, episode = _compile_programs(policy)
     goals = draw(shapes[1], local)
     result = jax.tree.map(lambda part: np.asarray(part)[:count], episode(*shapes[:1], goals, key[fill], winds))
     steps = round(Timing().reach / policy.env.control_period)
@@ -96,10 +96,10 @@ def reach_by_policy(
 
 
 @functools.lru_cache(maxsize=4)
-def _programs(policy: Policy) -> tuple[Any, Any]:
+def _compile_programs(policy: Policy) -> tuple[Any, Any]:
     """Return the compiled programs that render goal images of B arms from detected stalks and targets, and simulate reaches."""
     env: Any = policy.env
-    arms, gains, timing = arms_among(STALKS), Gains(), Timing()
+    arms, gains, timing = build_arm_model(STALKS), Gains(), Timing()
     observer = ImageObserver(arms.mj_model, env.camera, env.config)
     geoms = np.concatenate([arms.layout.lower_geom, arms.layout.upper_geom])
     substeps = round(env.control_period * control.RATE)
@@ -110,31 +110,31 @@ def _programs(policy: Policy) -> tuple[Any, Any]:
         return fitted(data)
 
     def draw(shape: Shape, target: jax.Array) -> jax.Array:
-        model = bending.fit(arms.model, arms.layout, shape)
+        model = bending.set_stalk_properties(arms.model, arms.layout, shape)
         data = bending.place_stands(arms.rest, arms.layout, shape)
         joints = stalk_arm.joints_at(target, 1.0)
         return image(model, mjx_model.kinematics(model, data.replace(qpos=data.qpos.at[: stalk_arm.ARM_JOINTS].set(joints))))
 
     def episode(shape: Shape, goal: jax.Array, key: jax.Array, wind: jax.Array) -> dict[str, jax.Array]:
-        scene = Scene(shape, bending.gusts(key, wind), jnp.float32(1.0))
-        model = bending.fit(arms.model, arms.layout, shape)
+        scene = Scene(shape, bending.sample_gusts(key, wind), jnp.float32(1.0))
+        model = bending.set_stalk_properties(arms.model, arms.layout, shape)
 
-        def step(moving: _Moving, _: None) -> tuple[_Moving, dict[str, jax.Array]]:
+        def step(moving: _LoopState, _: None) -> tuple[_LoopState, dict[str, jax.Array]]:
             reaching, place = moving
             action = jnp.clip(policy(image(model, reaching.data), goal), -1.0, 1.0)
-            wanted = within_reach(place + env.config.action_scale * action)
+            wanted = clamp_to_workspace(place + env.config.action_scale * action)
             is_closing = reaching.data.time > timing.reach - 0.5 / control.RATE
 
-            def one(reaching: Reaching, fraction: jax.Array) -> tuple[Reaching, None]:
-                return period(arms, model, scene, reaching, place + fraction * (wanted - place), is_closing, gains), None
+            def interpolate(reaching: Reaching, fraction: jax.Array) -> tuple[Reaching, None]:
+                return step_control(arms, model, scene, reaching, place + fraction * (wanted - place), is_closing, gains), None
 
-            reaching, _ = jax.lax.scan(one, reaching, jnp.arange(1, substeps + 1) / substeps)
+            reaching, _ = jax.lax.scan(interpolate, reaching, jnp.arange(1, substeps + 1) / substeps)
             reaching = reaching._replace(data=mjx_model.kinematics(model, reaching.data))
             now = {"path": wanted, "taken": stalk_arm.grip_at(reaching.data.qpos[:3]), "poses": reaching.data.qpos}
-            return _Moving(reaching, wanted), now
+            return _LoopState(reaching, wanted), now
 
         with jax.default_matmul_precision("highest"):
-            start = _Moving(begin(arms, scene, HOME), jnp.asarray(HOME, jnp.float32))
+            start = _LoopState(begin(arms, scene, HOME), jnp.asarray(HOME, jnp.float32))
             steps = round((timing.reach + timing.close) / env.control_period)
             (reaching, _), history = jax.lax.scan(step, start, length=steps)
         return {**history, "held": held_stalks(arms, reaching.data), "touched": reaching.touched, "brushed": reaching.brushed}

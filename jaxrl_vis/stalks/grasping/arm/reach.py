@@ -21,7 +21,7 @@ import numpy as np
 import jaxrl_vis_envs
 from jaxrl_vis.stalks.grasping.arm import control
 from jaxrl_vis.stalks.grasping.arm.approach import reachable
-from jaxrl_vis.stalks.grasping.arm.control import Drive, Gains, Timing
+from jaxrl_vis.stalks.grasping.arm.control import ControllerState, Gains, Timing
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.plants import bending
@@ -29,14 +29,14 @@ from jaxrl_vis_envs.plants.bending import Gusts, Layout, Shape
 from jaxrl_vis_envs.plants.stand import Stands
 from jaxrl_vis_envs.tasks import stalk_arm
 
-_STEPS_A_POINT = 5  # physics steps between two points of a path
-_POINTS_A_CALL = 5
-INTERVAL = _STEPS_A_POINT / control.RATE
+_STEPS_PER_POINT = 5  # physics steps between two points of a path
+_POINTS_PER_CALL = 5
+POINT_INTERVAL = _STEPS_PER_POINT / control.RATE
 """Time between two points of a path, s."""
-LOOK = _POINTS_A_CALL * INTERVAL
-"""Time between two calls of ``observer``, s."""
+LOOK_INTERVAL = _POINTS_PER_CALL * POINT_INTERVAL
+"""Time between two calls of the ``observer`` of `reach`, s."""
 _MIN_ARMS = 8  # minimum batch size of a compiled program
-_TOUCH = 0.0015  # m, a jaw nearer to a stalk presses on it: soft contacts give way by some tenths of a millimetre
+_CONTACT_DISTANCE = 0.0015  # m, a jaw nearer to a stalk presses on it: soft contacts give way by some tenths of a millimetre
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,11 +63,11 @@ class ReachResult:
     reachable: np.ndarray
     error: np.ndarray
     poses: np.ndarray
-    interval: float = INTERVAL
+    interval: float = POINT_INTERVAL
 
 
 class ArmView(NamedTuple):
-    """True state of B reaches at one time, from which a ``observer`` function may simulate detections.
+    """True state of B reaches at one time, from which an ``observer`` may simulate detections.
 
     Attributes:
         time: Time since the start, s.
@@ -86,13 +86,13 @@ class Reaching(NamedTuple):
 
     Attributes:
         data: State of the physics, an `mjx.Data`.
-        drive: State of the controllers.
+        controllers: State of the controllers.
         start: [3] float32, position of the grip at time 0, m in the frame of the stand.
         touched, brushed: [N] bool, stalks touched so far; see `ReachResult`.
     """
 
     data: Any
-    drive: Drive
+    controllers: ControllerState
     start: jax.Array
     touched: jax.Array
     brushed: jax.Array
@@ -106,7 +106,7 @@ class Scene(NamedTuple):
     side: jax.Array
 
 
-class Arms(NamedTuple):
+class ArmModel(NamedTuple):
     """MJX model of an arm among N stalks, with lookup tables.
 
     Attributes:
@@ -125,7 +125,7 @@ class Arms(NamedTuple):
 
 
 @functools.cache
-def arms_among(stalks: int) -> Arms:
+def build_arm_model(stalks: int) -> ArmModel:
     """Build the model of an arm among a number of ``stalks``; cached."""
     mj_model = stalk_arm.build(stalks)
     layout = bending.read_layout(mj_model)
@@ -136,7 +136,7 @@ def arms_among(stalks: int) -> Arms:
     for name in stalk_arm.JAWS + stalk_arm.LINKS:
         pairs = [{mj_model.geom(name).id, int(geom)} for geom in layout.upper_geom]
         places[name] = np.array([next(i for i, geom in enumerate(geoms) if set(geom) == pair) for pair in pairs])
-    return Arms(mj_model, model, layout, rest, places)
+    return ArmModel(mj_model, model, layout, rest, places)
 
 
 def reach(
@@ -159,16 +159,16 @@ def reach(
         wind_mm: Amplitude of the stalks' sway (`bending.Gusts.strength`), mm; [] or [B], 0 to 20 in the field.
         timing: Durations of the phases of a reach; None for the default.
         gains: Gains of the controllers; None for the default.
-        sides: [B], 1 or -1, solution of the inverse kinematics of each arm (see `approach.room`); None for
+        sides: [B], 1 or -1, solution of the inverse kinematics of each arm (see `approach.clearance`); None for
             `control.better_side`.
-        observer: Function called every `LOOK` s during the reach and while the jaws close, which returns new targets [B, 3],
-            m in the plot's frame, with NaN to keep the old one; None for an open loop.
+        observer: Function called every `LOOK_INTERVAL` s during the reach and while the jaws close, which returns new targets
+            [B, 3], m in the plot's frame; those that are NaN or out of reach leave the old one. None for an open loop.
 
     Returns:
         Results of the reaches. Arms whose target is out of reach are not sent: they hold and touch nothing.
 
     Raises:
-        ValueError: Shapes differ, a target is not finite, or the wind is negative.
+        ValueError: A shape is wrong, a target is not finite, the wind is negative, or a side is neither 1 nor -1.
     """
     timing, gains = timing or Timing(), gains or Gains()
     count, targets = len(stands), np.array(targets, np.float32)
@@ -187,24 +187,24 @@ def reach(
     if key.shape not in ((), (count,)):
         raise ValueError(f"there must be one key, or one for each of {count} arms, got {list(key.shape)}")
     if not count:
-        return _empty(stands, timing)
+        return _empty_result(stands, timing)
     # Pad the batch to the size of the program with copies of the first arm.
     fill = np.concatenate([np.arange(count), np.zeros(max(_MIN_ARMS, 1 << (count - 1).bit_length()) - count, int)])
-    start, advance = _programs(stands.stalk.shape[1], timing, gains)
+    start, advance = _compile_programs(stands.stalk.shape[1], timing, gains)
     shape = jax.tree.map(lambda part: part[fill], bending.shapes(stands))
     winds = np.broadcast_to(wind / 1000, (count,))[fill]
     keys = key[fill] if key.shape else jax.random.split(key, len(fill))
     scene, reaching = start(shape, keys, winds, side[fill])
     parts, aimed_at = [], targets
-    for call in range(_calls(timing.reach) + _calls(timing.close)):
+    for call in range(_count_calls(timing.reach) + _count_calls(timing.close)):
         if observer is not None and call:
-            targets = _observe_targets(observer, stands, targets, can, call * LOOK, parts[-1])
-        if call < _calls(timing.reach):
+            targets = _observe_targets(observer, stands, targets, can, call * LOOK_INTERVAL, parts[-1])
+        if call < _count_calls(timing.reach):
             aimed_at = targets
         reaching, report = advance(scene, reaching, (targets - stands.origin)[fill])
         parts.append(jax.tree.map(lambda part: np.asarray(part)[:count], report))
     paths = {name: np.concatenate([part[name] for part in parts], axis=1) for name in ("path", "taken", "poses")}
-    closing = parts[_calls(timing.reach) - 1]
+    closing = parts[_count_calls(timing.reach) - 1]
     error = np.linalg.norm(closing["taken"][:, -1] - (aimed_at - stands.origin), axis=-1)
     mine = can[:, None] & stands.is_present
     return ReachResult(
@@ -220,37 +220,54 @@ def reach(
 
 
 def _observe_targets(
-    observer: Callable[[ArmView], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
+    observer: Callable[[ArmView], np.ndarray],
+    stands: Stands,
+    targets: np.ndarray,
+    is_reachable: np.ndarray,
+    time: float,
+    report: dict,
 ) -> np.ndarray:
-    """Return the targets [B, 3] after another look, unchanged where it gives none or one that is out of reach."""
+    """Return the targets [B, 3] after a call of the observer, unchanged where its target is not finite or out of reach.
+
+    Args:
+        observer: See `reach`.
+        stands: True stalks around each of B arms.
+        targets: [B, 3] float32, present targets, m in the plot's frame.
+        is_reachable: [B] bool, arms whose first target was within reach; the targets of the others are unchanged.
+        time: Time since the start, s.
+        report: Last report of `_advance`, batched.
+
+    Raises:
+        ValueError: The observer returns targets of another shape.
+    """
     places = np.where(stands.is_present[..., None], report["stalks"], np.nan) + stands.origin[:, None]
     updated = np.asarray(observer(ArmView(time, report["taken"][:, -1] + stands.origin, places)), np.float32)
     if updated.shape != targets.shape:
         raise ValueError(f"a look must return targets {list(targets.shape)}, got {list(updated.shape)}")
     there = np.all(np.isfinite(updated), axis=-1)
-    there &= can & reachable(stands.origin, np.where(there[:, None], updated, 0.0))
+    there &= is_reachable & reachable(stands.origin, np.where(there[:, None], updated, 0.0))
     return np.where(there[:, None], updated, targets)
 
 
-def _calls(seconds: float) -> int:
-    return max(round(seconds / LOOK), 1)
+def _count_calls(seconds: float) -> int:
+    return max(round(seconds / LOOK_INTERVAL), 1)
 
 
-def _empty(stands: Stands, timing: Timing) -> ReachResult:
-    """Return the result of an empty batch."""
-    points, stalks = _POINTS_A_CALL * (_calls(timing.reach) + _calls(timing.close)), stands.stalk.shape[1]
+def _empty_result(stands: Stands, timing: Timing) -> ReachResult:
+    """Return the result of no reaches: arrays with B = 0."""
+    points, stalks = _POINTS_PER_CALL * (_count_calls(timing.reach) + _count_calls(timing.close)), stands.stalk.shape[1]
     none, path = np.zeros((0, stalks), bool), np.zeros((0, points, 3), np.float32)
-    poses = np.zeros((0, points, arms_among(stalks).mj_model.nq), np.float32)
+    poses = np.zeros((0, points, build_arm_model(stalks).mj_model.nq), np.float32)
     return ReachResult(none, path, path, none, none, np.zeros(0, bool), np.zeros(0, np.float32), poses)
 
 
 @functools.cache
-def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
-    """Return the compiled programs that start B arms and advance them by `LOOK` s."""
-    arms = arms_among(stalks)
+def _compile_programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
+    """Return the compiled programs that start B arms and advance them by `LOOK_INTERVAL` s."""
+    arms = build_arm_model(stalks)
 
     def start(shape: Shape, key: jax.Array, wind: jax.Array, side: jax.Array) -> tuple[Scene, Reaching]:
-        scene = Scene(jax.tree.map(jnp.asarray, shape), bending.gusts(key, wind), side)
+        scene = Scene(jax.tree.map(jnp.asarray, shape), bending.sample_gusts(key, wind), side)
         return scene, begin(arms, scene)
 
     def advance(scene: Scene, reaching: Reaching, target: jax.Array) -> tuple[Reaching, dict[str, jax.Array]]:
@@ -259,41 +276,41 @@ def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
     return jaxrl_vis_envs.jit(jax.vmap(start), runs_once=True), jaxrl_vis_envs.jit(jax.vmap(advance))
 
 
-def begin(arms: Arms, scene: Scene, home: tuple[float, float, float] = control.HOME) -> Reaching:
+def begin(arms: ArmModel, scene: Scene, home: tuple[float, float, float] = control.HOME) -> Reaching:
     """Return the initial state of an arm with its grip at ``home`` (m, frame of the stand) among swaying stalks."""
-    model = bending.fit(arms.model, arms.layout, scene.shape)
+    model = bending.set_stalk_properties(arms.model, arms.layout, scene.shape)
     data = bending.place_stands(arms.rest, arms.layout, scene.shape)
     swayed = bending.hinge_angles(arms.layout, model.nv, bending.displacement(scene.gusts, scene.shape.foot, 0.0))
     joints = stalk_arm.joints_at(jnp.asarray(home, jnp.float32), scene.side)
     data = mjx_model.kinematics(model, data.replace(qpos=(data.qpos + swayed).at[: stalk_arm.ARM_JOINTS].set(joints)))
     nothing = jnp.zeros(len(arms.layout.mocap), bool)
-    return Reaching(data, control.start_drive(joints), stalk_arm.grip_at(joints), nothing, nothing)
+    return Reaching(data, control.init_controllers(joints), stalk_arm.grip_at(joints), nothing, nothing)
 
 
 def _advance(
-    arms: Arms, scene: Scene, reaching: Reaching, target: jax.Array, timing: Timing, gains: Gains
+    arms: ArmModel, scene: Scene, reaching: Reaching, target: jax.Array, timing: Timing, gains: Gains
 ) -> tuple[Reaching, dict[str, jax.Array]]:
-    """Advance a reach to ``target`` [3] (m, frame of the stand) by `LOOK` s.
+    """Advance a reach to ``target`` [3] (m, frame of the stand) by `LOOK_INTERVAL` s.
 
     Returns:
         The new state, and a report: path, actual positions and poses at each point, held and touched stalks, and the positions
         of the stalks at the target's height.
     """
-    model = bending.fit(arms.model, arms.layout, scene.shape)
+    model = bending.set_stalk_properties(arms.model, arms.layout, scene.shape)
 
     def step(reaching: Reaching, _: None) -> tuple[Reaching, None]:
         time = reaching.data.time
         wanted = control.plan_movement(target, reaching.start, time + 1.0 / control.RATE, timing)
-        return period(arms, model, scene, reaching, wanted, time > timing.reach - 0.5 / control.RATE, gains), None
+        return step_control(arms, model, scene, reaching, wanted, time > timing.reach - 0.5 / control.RATE, gains), None
 
     def point(reaching: Reaching, _: None) -> tuple[Reaching, dict[str, jax.Array]]:
-        reaching = jax.lax.scan(step, reaching, length=_STEPS_A_POINT)[0]
+        reaching = jax.lax.scan(step, reaching, length=_STEPS_PER_POINT)[0]
         data = reaching.data
         path = control.plan_movement(target, reaching.start, data.time, timing)
         return reaching, {"path": path, "taken": stalk_arm.grip_at(data.qpos[:3]), "poses": data.qpos}
 
     with jax.default_matmul_precision("highest"):
-        reaching, report = jax.lax.scan(point, reaching, length=_POINTS_A_CALL)
+        reaching, report = jax.lax.scan(point, reaching, length=_POINTS_PER_CALL)
     data = mjx_model.kinematics(model, reaching.data)
     report |= {
         "held": held_stalks(arms, data),
@@ -304,23 +321,26 @@ def _advance(
     return reaching._replace(data=data), report
 
 
-def period(
-    arms: Arms, model: Any, scene: Scene, reaching: Reaching, targets: jax.Array, is_closing: jax.Array, gains: Gains
+def step_control(
+    arms: ArmModel, model: Any, scene: Scene, reaching: Reaching, target: jax.Array, is_closing: jax.Array, gains: Gains
 ) -> Reaching:
     """Advance controllers and physics by one control period.
 
     Args:
         arms: Model with its lookup tables.
-        model: Model with the stalks of the scene (`bending.fit`).
+        model: Model with the stalks of the scene (`bending.set_stalk_properties`).
         scene: Constants of the reach.
         reaching: State of the arm.
-        targets: [3], setpoint of the grip, m in the frame of the stand.
+        target: [3], setpoint of the grip, m in the frame of the stand.
         is_closing: [] bool, whether the jaws close.
         gains: Gains of the controllers.
+
+    Returns:
+        The new state of the arm; positions of bodies and geoms in its physics are stale until `mjx_model.kinematics`.
     """
     data = reaching.data
-    memory, forces = control.drive(
-        reaching.drive, data.qpos[:3], data.qvel[:3], stalk_arm.joints_at(targets, scene.side), gains
+    memory, forces = control.step_controllers(
+        reaching.controllers, data.qpos[:3], data.qvel[:3], stalk_arm.joints_at(target, scene.side), gains
     )
     jaws = jnp.where(is_closing, gains.jaw_force, -gains.jaw_force) * jnp.ones(2, jnp.float32)
     wind = bending.wind_torque(model, arms.layout, scene.gusts, scene.shape.foot, data.time)
@@ -332,7 +352,7 @@ def period(
     return Reaching(data, memory, reaching.start, touched, reaching.brushed | (by_gripper & ~is_closing))
 
 
-def held_stalks(arms: Arms, data: Any) -> jax.Array:
+def held_stalks(arms: ArmModel, data: Any) -> jax.Array:
     """Return True for stalks that the jaws hold, [N] bool: those between the jaws on which at least one jaw presses."""
     across, along = stalk_arm.grip_frame(data.qpos[:3])
     grip = stalk_arm.grip_at(data.qpos[:3])
@@ -342,5 +362,5 @@ def held_stalks(arms: Arms, data: Any) -> jax.Array:
     is_between = (aside > data.qpos[3] - open_at) & (aside < open_at - data.qpos[4])
     is_between &= (ahead > stalk_arm.PALM) & (ahead < stalk_arm.TIPS)
     distance = data._impl.contact.dist
-    pressed = jnp.stack([distance[arms.contacts[name]] < _TOUCH for name in stalk_arm.JAWS]).any(axis=0)
+    pressed = jnp.stack([distance[arms.contacts[name]] < _CONTACT_DISTANCE for name in stalk_arm.JAWS]).any(axis=0)
     return is_between & pressed

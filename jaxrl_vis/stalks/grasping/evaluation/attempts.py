@@ -17,16 +17,16 @@ import numpy as np
 
 from jaxrl_vis.run.trained.policy import Policy
 from jaxrl_vis.stalks.grasping.arm import approach
-from jaxrl_vis.stalks.grasping.arm.choice import Choice, choose, choose_nearest, stalk_radii
+from jaxrl_vis.stalks.grasping.arm.choice import Choice, choose_approaches, choose_nearest, stalk_radii
 from jaxrl_vis.stalks.grasping.arm.policy_loop import HEIGHTS as POLICY_HEIGHTS
 from jaxrl_vis.stalks.grasping.arm.policy_loop import STALKS as POLICY_STALKS
 from jaxrl_vis.stalks.grasping.arm.policy_loop import reach_by_policy
 from jaxrl_vis.stalks.grasping.arm.reach import ArmView, ReachResult, reach
-from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Standing, match
+from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Standing, match_grasps
 from jaxrl_vis.stalks.grasping.evaluation.scoring import RADIUS, Scene, driven_stretch
 from jaxrl_vis.stalks.grasping.perception.lines import PREFERRED, GraspPoint
 from jaxrl_vis.stalks.grasping.perception.perceive import Perception
-from jaxrl_vis.stalks.grasping.perception.stalk_segments import StalkSegments, stalk_segments
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import StalkSegments, extract_stalk_segments
 from jaxrl_vis.stalks.grasping.perception.stitch import Motion
 from jaxrl_vis_envs.plants import Plot
 from jaxrl_vis_envs.plants.stand import (
@@ -42,10 +42,12 @@ from jaxrl_vis_envs.plants.stand import (
 Loop = Literal["open", "again", "policy"]
 
 _MAX_ARMS = 1024  # arms per call of a compiled program
-_AROUND = 0.1  # m: range above and below the grasp in which a pair detects the stalk again, short enough for a straight line
-_BESIDE = 0.015  # m: segments farther than this from the line belong to another stalk
+_HALF_RANGE = (
+    0.1  # m: range above and below the grasp in which a pair detects the stalk again, short enough for a straight line
+)
+_MAX_OFFSET = 0.015  # m: segments farther than this from the line belong to another stalk
 _MIN_SEGMENTS = 5  # minimum number of segments
-_AHEAD = 1.5  # looks: horizon of the linear extrapolation of a stalk's motion
+_HORIZON = 1.5  # looks: horizon of the linear extrapolation of a stalk's motion
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,8 +61,8 @@ class Plan:
         errors: [B] float64, horizontal distance of the target from that stalk, m; NaN for none.
         sides: [B] float64, 1 or -1: solution of the inverse kinematics.
         refused: [B] bool, whether the arm is not sent because other stalks are in its path.
-        again: [B, 2] float64, error of the stalk's position as detected by the pair at the stop alone, along and across the
-            row, m; NaN where the pair does not show the stalk.
+        redetection_errors: [B, 2] float64, error of the stalk's position as detected by the pair at the stop alone, along and
+            across the row, m; NaN where the pair does not show the stalk.
         stands: True stalks around the arm at the stop of each attempt.
         standing: True stalks of the stretch that the run passes.
         detected: Detected stalks around the arm, laid out as `stands`; None unless planned for a policy, or without targets.
@@ -72,7 +74,7 @@ class Plan:
     errors: np.ndarray
     sides: np.ndarray
     refused: np.ndarray
-    again: np.ndarray
+    redetection_errors: np.ndarray
     stands: Stands
     standing: tuple[Standing, ...]
     detected: Stands | None = None
@@ -94,11 +96,11 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
     plot, poses = scene.plot, scene.drive.poses
     low, high = driven_stretch(plot)
     masts, points = mast_positions(perception), perception.points
-    chosen = choose_nearest(points, masts, POLICY_HEIGHTS) if for_policy else choose(points, masts)
+    chosen = choose_nearest(points, masts, POLICY_HEIGHTS) if for_policy else choose_approaches(points, masts)
     targets = np.array([_to_plot_frame(choice, scene, perception) for choice in chosen]).reshape(-1, 3)
     places = np.array([[stalk.at_height(target[2])[0][:2] for stalk in plot.measured] for target in targets])
     places = places.reshape(len(targets), len(plot.measured), 2)
-    stalks = match(targets[:, :2], places, RADIUS)
+    stalks = match_grasps(targets[:, :2], places, RADIUS)
     origins = np.array([stand_origin(pose.position[0]) for pose in poses])
     standing = _true_stalks(plot, origins, number)
     known = {stalk.stalk for stalk in standing}
@@ -109,7 +111,8 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
     ]
     off = np.array([_offset_from_stalk(targets[place], places[place], stalks[place]) for place in scored]).reshape(-1, 2)
     segments = {
-        stop: stalk_segments(perception.clouds[stop], scene.drive.stated, scene.mount, stop) for stop in range(len(poses))
+        stop: extract_stalk_segments(perception.clouds[stop], scene.drive.stated, scene.mount, stop)
+        for stop in range(len(poses))
     }
     again = [
         off[index] + _offset_at_stop(chosen[place], points[place], perception, segments) for index, place in enumerate(scored)
@@ -123,7 +126,7 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
         errors=np.linalg.norm(off, axis=-1),
         sides=np.array([chosen[place].side for place in scored], float),
         refused=np.array([chosen[place].is_blocked and not for_policy for place in scored], bool),
-        again=np.array(again, float).reshape(-1, 2),
+        redetection_errors=np.array(again, float).reshape(-1, 2),
         stands=stands_at(plot, at, targets[scored], POLICY_STALKS if for_policy else STALKS),
         standing=standing,
         detected=concatenate_stands(detected) if for_policy and detected else None,
@@ -147,14 +150,14 @@ def _to_plot_frame(choice: Choice, scene: Scene, perception: Perception, points:
 def _detections_around(choice: Choice, x: float, target: np.ndarray, scene: Scene, perception: Perception) -> Stands:
     """Return the detected stalks around an arm with its mast ``x`` m along the row, for a target [3] in the plot's frame."""
     height = float(choice.point[2])
-    ends = np.array([point.at_height(np.array([height, height + _AROUND])) for point in perception.points])
+    ends = np.array([point.at_height(np.array([height, height + _HALF_RANGE])) for point in perception.points])
     ends = _to_plot_frame(choice, scene, perception, ends)
     return stand_of_lines(ends[:, 0], ends[:, 1] - ends[:, 0], stalk_radii(perception.points, height), x, target, POLICY_STALKS)
 
 
-def _offset_from_stalk(target: np.ndarray, places: np.ndarray, stalk: int) -> np.ndarray:
+def _offset_from_stalk(target: np.ndarray, positions: np.ndarray, stalk: int) -> np.ndarray:
     """Return the horizontal offset [2] of a target from its stalk, m; NaN without one."""
-    return target[:2] - places[stalk] if stalk >= 0 else np.full(2, np.nan)
+    return target[:2] - positions[stalk] if stalk >= 0 else np.full(2, np.nan)
 
 
 def _offset_at_stop(
@@ -170,11 +173,11 @@ def _offset_at_stop(
     motion: Motion = perception.to_last[choice.stop]
     middles_here = motion(segments[choice.stop].middle)
     offsets = (middles_here - point.at_height(middles_here[:, 2]))[:, :2]
-    near = (np.abs(middles_here[:, 2] - choice.point[2]) < _AROUND) & (np.linalg.norm(offsets, axis=1) < _BESIDE)
+    near = (np.abs(middles_here[:, 2] - choice.point[2]) < _HALF_RANGE) & (np.linalg.norm(offsets, axis=1) < _MAX_OFFSET)
     return np.median(offsets[near], axis=0) if near.sum() >= _MIN_SEGMENTS else np.full(2, np.nan)
 
 
-def from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
+def reachable_from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
     """Return True for points that are within the arm's reach from any of the stops.
 
     Args:
@@ -189,7 +192,13 @@ def from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
 
 
 def _true_stalks(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, ...]:
-    """Return the true stalks of the stretch, with their reachability and room at the preferred height."""
+    """Return the true stalks of the stretch that the run passes, with their reachability and room at the preferred height.
+
+    Args:
+        plot: The plot.
+        origins: [S, 3] float64, `Stands.origin` of the arm at each stop, m in the plot's frame.
+        number: Number of the run.
+    """
     low, high = driven_stretch(plot)
     middles = np.array([stalk.at_height(PREFERRED)[0] for stalk in plot.measured]).reshape(-1, 3)
     radii = np.array([0.5 * stalk.diameter(PREFERRED) for stalk in plot.measured])
@@ -218,6 +227,9 @@ def execute_plans(
 
     Returns:
         One attempt for each target, in the order of the plans; refused ones hold and touch nothing.
+
+    Raises:
+        RequestError: The policy is not one of VisualStalkReach, or does not observe single images.
     """
     attempts: list[Attempt] = []
     for block in _blocks(list(plans)):
@@ -225,7 +237,7 @@ def execute_plans(
         places = np.concatenate([np.arange(len(plan.targets)) for plan in block])
         targets, stalks, errors, sides, refused, again = (
             np.concatenate([getattr(plan, name) for plan in block])
-            for name in ("targets", "stalks", "errors", "sides", "refused", "again")
+            for name in ("targets", "stalks", "errors", "sides", "refused", "redetection_errors")
         )
         stands = concatenate_stands([plan.stands for plan in block])
         keys = wind_keys(numbers, places, seed)
@@ -234,16 +246,22 @@ def execute_plans(
             assert policy is not None and len(detected) == len(block)
             result = reach_by_policy(stands, concatenate_stands(detected), targets, policy, keys, wind_mm)
         else:
-            look = follow(stands, stalks, again) if loop == "again" else None
+            look = redetecting_observer(stands, stalks, again) if loop == "again" else None
             result = reach(stands, targets, keys, wind_mm, sides=sides, observer=look)
         attempts += to_attempts(stands, result, numbers, stalks, errors, refused)
     return attempts
 
 
-def wind_keys(runs: np.ndarray, places: np.ndarray, seed: int = 0) -> jax.Array:
-    """Return typed keys [B] for sampling the wind of attempts number ``places`` [B] int of runs ``runs`` [B] int."""
+def wind_keys(runs: np.ndarray, indices: np.ndarray, seed: int = 0) -> jax.Array:
+    """Return typed keys [B] for sampling the wind, derived from each attempt's run, its index within the run, and the seed.
+
+    Args:
+        runs: [B] int, numbers of the runs.
+        indices: [B] int, indices of the attempts within their runs.
+        seed: Seed of the wind.
+    """
     of_runs = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(seed), runs)
-    return jax.vmap(jax.random.fold_in)(of_runs, places)
+    return jax.vmap(jax.random.fold_in)(of_runs, indices)
 
 
 def to_attempts(
@@ -275,18 +293,18 @@ def to_attempts(
     return attempts
 
 
-def follow(stands: Stands, stalks: np.ndarray, redetected: np.ndarray) -> Callable[[ArmView], np.ndarray]:
-    """Return a ``look`` function for `reach` that simulates detecting the targets [B, 3] again on the way.
+def redetecting_observer(stands: Stands, stalks: np.ndarray, redetected: np.ndarray) -> Callable[[ArmView], np.ndarray]:
+    """Return an ``observer`` for `reach` that simulates detecting the targets [B, 3] again on the way.
 
     The pair at the stop does not move. It detects the stalk at its true position plus the error that the pair alone makes with
-    this stalk at rest; stalks that it does not show at rest are not detected. A detection is available one look later, and the
-    position is extrapolated linearly from the last two. Occlusion by the arm itself is not modelled. The function keeps the
-    history of one batch of reaches: do not reuse it for another.
+    this stalk at rest; stalks that it does not show at rest are not detected. A detection is available one call later, and the
+    position is extrapolated linearly from the last two, so that the first two calls return NaN. Occlusion by the arm itself is
+    not modelled. The function keeps the history of one batch of reaches: do not reuse it for another.
 
     Args:
         stands: True stalks around each arm.
         stalks: [B] int, index of the stalk that each arm reaches for; -1 for none.
-        redetected: [B, 2], see `Plan`.
+        redetected: [B, 2], m, see `Plan.redetection_errors`.
     """
     known = (stands.stalk == stalks[:, None]) & (stalks >= 0)[:, None]
     slot = known.argmax(axis=1)
@@ -300,7 +318,7 @@ def follow(stands: Stands, stalks: np.ndarray, redetected: np.ndarray) -> Callab
         if len(places) < 3:
             return np.full_like(place, np.nan)
         before, last = places[-3:-1]
-        ahead = _AHEAD * (last - before)
+        ahead = _HORIZON * (last - before)
         ahead[:, 2] = 0.0  # keep the chosen height of the grasp
         return last + ahead
 

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-ROOM = 0.005
+MIN_JAW_ROOM = 0.005
 """Minimum room beside the open jaws, m, below which a stalk is crowded: the jaws cannot take it alone."""
 NEIGHBOUR_EDGES = (0.0, 0.03, 0.04, 0.05, 0.065, 0.1, math.inf)
 """Bin edges of distances to the nearest neighbour, m, centre to centre."""
@@ -27,7 +27,7 @@ class Attempt:
 
     Attributes:
         run: Number of the run.
-        stalk: Index of the stalk that the grasp point is matched with (`match`); None if there is none.
+        stalk: Index of the stalk that the grasp point is matched with (`match_grasps`); None if there is none.
         held: Indices of the stalks between the closed jaws.
         reachable: Whether the grasp point is within the arm's reach; if not, nothing is held.
         refused: Whether the arm was not sent because detected stalks were in its path; if so, nothing is held.
@@ -73,7 +73,7 @@ class Standing:
         stalk: Index of the stalk.
         reachable: Whether the stalk is within the arm's reach from any stop of the run.
         room: Clearance between the open gripper and other stalks on the best path, m; -inf if unreachable; see
-            `approach.room`.
+            `approach.clearance`.
         neighbour: Distance to the nearest other stalk at the height of the grasp, centre to centre, m; inf if there is none.
     """
 
@@ -85,8 +85,8 @@ class Standing:
 
     @property
     def crowded(self) -> bool:
-        """True if the jaws cannot take the stalk alone: its `room` is less than `ROOM`."""
-        return self.room < ROOM
+        """True if the jaws cannot take the stalk alone: its `room` is less than `MIN_JAW_ROOM`."""
+        return self.room < MIN_JAW_ROOM
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,28 +96,28 @@ class Proportion:
     Attributes:
         name: Name of the proportion.
         count: Number of hits.
-        of: Total number.
+        total: Total number.
     """
 
     name: str
     count: int
-    of: int
+    total: int
 
     @property
     def value(self) -> float:
         """Proportion, 0 to 1."""
-        return self.count / self.of if self.of else math.nan
+        return self.count / self.total if self.total else math.nan
 
     @property
     def interval(self) -> tuple[float, float]:
         """Lower and upper bound of the Wilson interval."""
-        return wilson(self.count, self.of)
+        return wilson_interval(self.count, self.total)
 
     def __str__(self) -> str:
-        if not self.of:
+        if not self.total:
             return f"{self.name}: none"
         low, high = self.interval
-        return f"{self.name}: {self.value:.1%} ({self.count} of {self.of}; {low:.1%} to {high:.1%})"
+        return f"{self.name}: {self.value:.1%} ({self.count} of {self.total}; {low:.1%} to {high:.1%})"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,8 +174,8 @@ class Score:
         )
 
 
-def wilson(count: int, total: int, z: float = 1.959964) -> tuple[float, float]:
-    """Return the Wilson interval of a proportion ``count / of``; (NaN, NaN) if ``total`` is 0.
+def wilson_interval(count: int, total: int, z: float = 1.959964) -> tuple[float, float]:
+    """Return the Wilson score interval of a proportion ``count / total``; (NaN, NaN) if ``total`` is 0.
 
     Args:
         count: Number of hits.
@@ -195,7 +195,7 @@ def wilson(count: int, total: int, z: float = 1.959964) -> tuple[float, float]:
     return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
-def match(points: np.ndarray, stalks: np.ndarray, gate: float) -> np.ndarray:
+def match_grasps(points: np.ndarray, stalks: np.ndarray, gate: float) -> np.ndarray:
     """Match grasp points with stalks one to one: as many pairs as possible, with minimum total distance.
 
     Args:
@@ -285,7 +285,10 @@ def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: fl
 
 
 def thesis_ratio(attempts: Iterable[Attempt]) -> tuple[float, int]:
-    """Return the thesis's metric, averaged over the runs in which the arm was sent (NaN for none), and their number."""
+    """Return the thesis's metric 1 - |grasped - attempted| / attempted, averaged over runs, and the number of runs.
+
+    Only runs in which the arm was sent count; the metric is NaN if there are none.
+    """
     sent: Counter[int] = Counter()
     held: Counter[int] = Counter()
     for attempt in attempts:

@@ -20,7 +20,7 @@ from jaxrl_vis.run.trained.policy import Policy
 from jaxrl_vis.stalks.digests import value_digest
 from jaxrl_vis.stalks.grasping.evaluation.attempts import Loop, Plan, execute_plans, plan
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Score, Standing, score
-from jaxrl_vis.stalks.grasping.evaluation.scoring import MaskScore, RunScore, draw_scene, score_scene, summary
+from jaxrl_vis.stalks.grasping.evaluation.scoring import MaskScore, RunScore, draw_scene, score_scene, summarise_scores
 from jaxrl_vis.stalks.grasping.masks.loading import load_painter
 from jaxrl_vis.stalks.grasping.perception.perceive import Variant
 from jaxrl_vis_envs.plants import Family
@@ -104,6 +104,9 @@ def evaluate_run(conditions: Conditions, number: int) -> Record:
     Args:
         conditions: Conditions of all runs.
         number: Seed of the row.
+
+    Raises:
+        RequestError: The weights cannot be read.
     """
     scene = draw_scene(conditions.family, number)
     painter = None if conditions.weights is None else load_painter(conditions.weights)
@@ -121,8 +124,13 @@ def evaluate_run(conditions: Conditions, number: int) -> Record:
 
 
 def summarise(records: Sequence[Record]) -> dict[str, Any]:
-    """Summarise the records of runs: the figures of `scoring.summary`, and of each kind of reaches that all records hold."""
-    figures: dict[str, Any] = summary([read_score(record) for record in records])
+    """Summarise the records of runs, as values for JSON.
+
+    Returns:
+        The figures of `summarise_scores`, ``devices`` and ``workers`` of the records, and under ``reaches`` the scores of those
+        `Reaches` that all records hold, by name.
+    """
+    figures: dict[str, Any] = summarise_scores([read_score(record) for record in records])
     figures["devices"] = sorted({record["device"] for record in records})
     figures["workers"] = sorted({record["workers"] for record in records})
     known = [set(record.get("reaches", {})) for record in records]
@@ -132,9 +140,9 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
 
 
 def score_figures(score: Score) -> dict[str, Any]:
-    """Return the thesis's ratio and all proportions of a score, as values for JSON."""
+    """Return the thesis's ratio and all proportions of a score, with counts and intervals, as values for JSON."""
     proportions = {
-        proportion.name: {"count": proportion.count, "of": proportion.of, "interval": proportion.interval}
+        proportion.name: {"count": proportion.count, "of": proportion.total, "interval": proportion.interval}
         for proportion in score.proportions
     }
     return {"thesis_ratio": score.thesis_ratio, "shares": proportions}
@@ -142,7 +150,7 @@ def score_figures(score: Score) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Reaches:
-    """Kind of reaches, with its parameters; ``str`` gives its name in the records.
+    """Control loop, wind and planning of simulated reaches; ``str`` gives their name in the records.
 
     Attributes:
         loop: Control loop of the arm: open, with repeated detection, or a policy.
@@ -169,12 +177,15 @@ class Reaches:
 
 
 def reach_all(table: RecordFile, numbers: Iterable[int], reaches: Reaches) -> None:
-    """Carry out reaches of one kind in the runs whose records lack them, and add the attempts to the records.
+    """Simulate reaches in the runs whose records lack them, and add the attempts to the records.
 
     Args:
         table: Records of all runs, changed in place and written to their file.
         numbers: Numbers of the runs.
-        reaches: Kind of reaches.
+        reaches: Control loop, wind and planning of the reaches.
+
+    Raises:
+        RequestError: The policy is not one of VisualStalkReach, or does not observe single images.
     """
     name = str(reaches)
     missing = [number for number in numbers if name not in table.records[number].get("reaches", {})]
@@ -189,7 +200,11 @@ def reach_all(table: RecordFile, numbers: Iterable[int], reaches: Reaches) -> No
 
 
 def grasp_score(records: Iterable[Record], name: str) -> Score:
-    """Return the score of all reaches of one kind in the records; ``name`` is the string of its `Reaches`."""
+    """Return the score of the reaches in all records that have a ``name``, the string of their `Reaches`.
+
+    Raises:
+        KeyError: A record lacks these reaches.
+    """
     attempts, standing = [], []
     for record in records:
         number, reaches = int(record["number"]), record["reaches"][name]
@@ -232,7 +247,7 @@ def _plan_record(plan: Plan) -> Record:
         "errors": plan.errors.round(_DIGITS).tolist(),
         "sides": plan.sides.tolist(),
         "refused": plan.refused.tolist(),
-        "again": plan.again.round(_DIGITS).tolist(),
+        "again": plan.redetection_errors.round(_DIGITS).tolist(),
         "stands": _stands_record(plan.stands),
         "seen": None if plan.detected is None else _stands_record(plan.detected),
         "standing": [
@@ -258,7 +273,7 @@ def read_plan(number: int, record: Record, name: str = "plan") -> Plan:
         errors=np.array(values["errors"], float),  # None becomes NaN
         sides=np.array(values["sides"], float),
         refused=np.array(values["refused"], bool),
-        again=np.array(values["again"], float).reshape(-1, 2),
+        redetection_errors=np.array(values["again"], float).reshape(-1, 2),
         stands=_read_stands(values["stands"]),
         standing=tuple(
             Standing(number, stalk, reachable, *(np.inf if length is None else length for length in (room, neighbour)))
@@ -283,7 +298,7 @@ def _attempt_record(attempt: Attempt) -> Record:
 
 
 def attempts_in(record: Record, name: str) -> list[Attempt]:
-    """Return the attempts of one kind of reaches in a run."""
+    """Return the attempts in the record of a run whose reaches have a ``name``, the string of their `Reaches`."""
     return [_read_attempt(int(record["number"]), values) for values in record["reaches"][name]["attempts"]]
 
 

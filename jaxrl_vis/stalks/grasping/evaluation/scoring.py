@@ -105,7 +105,7 @@ def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAU
 
     Args:
         scene: Pairs and ground truth of the run.
-        mask: Function that returns the mask of an image; None for true masks.
+        mask: Function from a left image and the number of its pair to the image's mask, see `Mask`; None for true masks.
         variant: Steps that follow the thesis.
 
     Returns:
@@ -118,7 +118,7 @@ def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAU
         return painted[number]
 
     perception = perceive(scene.views, record_mask, scene.drive.stated, scene.mount, variant)
-    targets = in_world(perception, scene)
+    targets = points_in_plot(perception, scene)
     true, detected, errors = match_stalks(targets, scene.plot)
     poses = scene.drive.poses
     errors_of_stitches = [
@@ -140,7 +140,7 @@ def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAU
     return score, perception
 
 
-def in_world(perception: Perception, scene: Scene) -> np.ndarray:
+def points_in_plot(perception: Perception, scene: Scene) -> np.ndarray:
     """Return grasp points [B, 3] in the plot's frame, m, by the true pose at the last pair and the nominal mount."""
     points = np.array([point.point for point in perception.points]).reshape(-1, 3)
     return scene.drive.poses[-1].to_world(scene.mount.pose.to_camera(points))
@@ -162,7 +162,7 @@ def match_stalks(targets: np.ndarray, plot: Plot) -> tuple[int, int, np.ndarray]
 
     Returns:
         Number of stalks in the stretch; number of grasp points that are matched with one of them, or with no stalk and lie in
-        the stretch; and horizontal distances [K] of the matched ones, m.
+        the stretch; and horizontal distances [K] float64 between matched points and stalks in the stretch, m.
     """
     low, high = driven_stretch(plot)
     inside = np.array([low <= stalk.at_height(PREFERRED)[0][0] <= high for stalk in plot.measured], bool)
@@ -186,7 +186,13 @@ def true_motion(first: Pose, second: Pose, mount: Mount) -> Motion:
 
 
 def stitch_error(motion: Motion, first: Pose, second: Pose, mount: Mount) -> float:
-    """Return the mean horizontal error of a stitch over points of the row, m."""
+    """Return the mean horizontal error of a stitch over points of the row, m.
+
+    Args:
+        motion: Estimated motion from the robot frame of the first pair to that of the second.
+        first, second: True poses of the left camera at both pairs, in the plot's frame.
+        mount: Nominal mount of the cameras.
+    """
     away = float(0.5 * (first.position[1] + second.position[1]))
     places = np.array([[x, -away, z] for x in (-0.2, 0.0, 0.2) for z in (0.5, 0.75, 1.0)])
     difference = motion(places) - true_motion(first, second, mount)(places)
@@ -194,7 +200,7 @@ def stitch_error(motion: Motion, first: Pose, second: Pose, mount: Mount) -> flo
 
 
 def _mask_score(masks: list[tuple[np.ndarray, np.ndarray]]) -> MaskScore:
-    """Score pairs of predicted and true masks."""
+    """Score pairs of predicted and true masks, each [H, W] bool."""
     far = [_mean_outline_distance(*both) for both in masks]
     return MaskScore(
         hits=int(sum((painted & true).sum() for painted, true in masks)),
@@ -213,7 +219,7 @@ def _mean_outline_distance(painted: np.ndarray, true: np.ndarray) -> float:
     return 0.5 * float(far[0][outlines[1] > 0].mean() + far[1][outlines[0] > 0].mean())
 
 
-def summary(scores: Iterable[RunScore]) -> dict[str, Any]:
+def summarise_scores(scores: Iterable[RunScore]) -> dict[str, Any]:
     """Summarise the scores of runs.
 
     Returns:

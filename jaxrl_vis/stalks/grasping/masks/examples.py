@@ -39,7 +39,7 @@ def synthetic_examples(family: Family, seed: int, frames: int = 2) -> list[Examp
     Args:
         family: Family that the row is sampled from.
         seed: Seed of the row.
-        frames: Number of images, evenly spaced because consecutive pairs show nearly the same; at most all pairs.
+        frames: Maximum number of images, evenly spaced because consecutive pairs show nearly the same.
     """
     sequence = Sequence.of(draw(family, seed))
     length = len(sequence)

@@ -15,7 +15,7 @@ class Generator(nn.Module):
     """U-Net from images [N, H, W, 3] to [N, H, W, outputs] float32. H and W must be multiples of 2^len(channels).
 
     Attributes:
-        channels: Channels of each level; all but the first must be multiples of 8.
+        channels: Channels of each level, multiples of 8.
         outputs: Number of output channels: 3 for painted images in -1 to 1, 1 for logits of the mask.
         dtype: Compute dtype of the convolutions.
     """
@@ -26,24 +26,24 @@ class Generator(nn.Module):
 
     @nn.compact
     def __call__(self, images: jax.Array) -> jax.Array:
-        """Return painted images, or logits of masks, depending on ``outputs``."""
+        """Return painted images or logits of masks, depending on ``outputs``, as [N, H, W, outputs] float32."""
         x = images.astype(self.dtype)
         levels = []
         for depth, channels in enumerate(self.channels):
             x = nn.Conv(channels, (4, 4), (2, 2), dtype=self.dtype, use_bias=depth == 0)(x)
-            x = _normalised(x, self.dtype) if depth else x
+            x = _normalise(x, self.dtype) if depth else x
             x = nn.leaky_relu(x, 0.2)
             levels.append(x)
         for channels, skip in zip(reversed(self.channels[:-1]), reversed(levels[:-1])):
             x = nn.ConvTranspose(channels, (4, 4), (2, 2), dtype=self.dtype, use_bias=False)(x)
-            x = nn.relu(_normalised(x, self.dtype))
+            x = nn.relu(_normalise(x, self.dtype))
             x = jnp.concatenate([x, skip], axis=-1)
         x = nn.ConvTranspose(self.outputs, (4, 4), (2, 2), dtype=self.dtype)(x).astype(jnp.float32)
         return jnp.tanh(x) if self.outputs == 3 else x
 
 
 class Discriminator(nn.Module):
-    """PatchGAN discriminator: scores for each patch of 70 x 70 pixels whether a painted image is a true one.
+    """PatchGAN discriminator: classifies each patch of 70 x 70 pixels of a painted image as true or generated.
 
     Attributes:
         channels: Channels of the hidden layers; the last of these and the output layer keep the resolution.
@@ -60,10 +60,10 @@ class Discriminator(nn.Module):
         for depth, channels in enumerate(self.channels):
             strides = (2, 2) if depth < len(self.channels) - 1 else (1, 1)
             x = nn.Conv(channels, (4, 4), strides, dtype=self.dtype, use_bias=depth == 0)(x)
-            x = _normalised(x, self.dtype) if depth else x
+            x = _normalise(x, self.dtype) if depth else x
             x = nn.leaky_relu(x, 0.2)
         return nn.Conv(1, (4, 4), dtype=jnp.float32)(x)[..., 0]
 
 
-def _normalised(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
+def _normalise(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
     return nn.GroupNorm(num_groups=None, group_size=8, dtype=dtype)(x)

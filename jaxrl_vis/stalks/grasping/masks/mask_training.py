@@ -21,10 +21,10 @@ import optax
 from jaxrl_vis.stalks.grasping.masks.examples import Example
 from jaxrl_vis.stalks.grasping.masks.mask_networks import Discriminator
 from jaxrl_vis.stalks.grasping.masks.painter import Settings, compute_dtype, normalise
-from jaxrl_vis.stalks.grasping.masks.variation import vary
+from jaxrl_vis.stalks.grasping.masks.variation import augment
 from jaxrl_vis.stalks.phenotyping.detector.losses import mask_loss
 from jaxrl_vis.stalks.phenotyping.training.pool import Pool
-from jaxrl_vis.stalks.phenotyping.training.updates import Report, repeat
+from jaxrl_vis.stalks.phenotyping.training.updates import Report, run_updates
 
 _NEAR_TRUTH = 100.0
 """Weight of the mean absolute difference, as in pix2pix."""
@@ -58,7 +58,7 @@ class Plan:
     seed: int = 0
 
 
-def crops(examples: list[Example], rng: np.random.Generator, count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
+def sample_crops(examples: list[Example], rng: np.random.Generator, count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample a batch of crops at random positions.
 
     Args:
@@ -88,7 +88,7 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
     Args:
         state: Parameters of the generator, their average, parameters of the discriminator (None for segmentation), and the
             optimiser states of both; donated.
-        batch: Crops and their masks, see `crops`.
+        batch: Crops and their masks, see `sample_crops`.
         key: Typed key of the augmentation.
         rates: Learning rate and decay rate of the average.
         settings: Settings of the generator.
@@ -99,11 +99,11 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
     """
     generator, average, discriminator, moments = state
     rate, decay = rates
-    images, masks = vary(batch[0], batch[1], key)
+    images, masks = augment(batch[0], batch[1], key)
     network, judge, values = settings.generator(dtype), Discriminator(dtype=dtype), normalise(images)
     true = jnp.where(masks[..., None], jnp.array(_RED), values)
 
-    def of_generator(params: Any):
+    def generator_loss(params: Any):
         painted = network.apply(params, values)
         assert isinstance(painted, jax.Array)
         if settings.loss == "segmentation":
@@ -111,18 +111,18 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
             return loss, ({"mask": loss}, painted)
         verdict = judge.apply(discriminator, values, painted)
         assert isinstance(verdict, jax.Array)
-        deceived = optax.sigmoid_binary_cross_entropy(verdict, jnp.ones_like(verdict)).mean()
+        adversarial = optax.sigmoid_binary_cross_entropy(verdict, jnp.ones_like(verdict)).mean()
         difference = jnp.abs(painted - true).mean()
-        return deceived + _NEAR_TRUTH * difference, ({"deceived": deceived, "difference": difference}, painted)
+        return adversarial + _NEAR_TRUTH * difference, ({"adversarial": adversarial, "difference": difference}, painted)
 
-    gradients, (parts, painted) = jax.grad(of_generator, has_aux=True)(generator)
+    gradients, (parts, painted) = jax.grad(generator_loss, has_aux=True)(generator)
     updates, first = _optimiser().update(gradients, moments[0], generator)
     generator = jax.tree.map(lambda old, change: old + rate * change, generator, updates)
     average = jax.tree.map(lambda old, new: decay * old + (1.0 - decay) * new, average, generator)
     if settings.loss == "segmentation":
         return (generator, average, None, (first, None)), parts
 
-    def of_discriminator(params: Any) -> jax.Array:
+    def discriminator_loss(params: Any) -> jax.Array:
         verdicts = [judge.apply(params, values, painting) for painting in (true, jax.lax.stop_gradient(painted))]
         losses = [
             optax.sigmoid_binary_cross_entropy(verdict, jnp.full_like(verdict, wanted)).mean()  # pyright: ignore
@@ -130,11 +130,11 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
         ]
         return 0.5 * (losses[0] + losses[1])
 
-    judged, gradients = jax.value_and_grad(of_discriminator)(discriminator)
+    loss, gradients = jax.value_and_grad(discriminator_loss)(discriminator)
     updates, second = _optimiser().update(gradients, moments[1], discriminator)
     # As in pix2pix, the discriminator learns at half the speed.
     discriminator = jax.tree.map(lambda old, change: old + 0.5 * rate * change, discriminator, updates)
-    return (generator, average, discriminator, (first, second)), {**parts, "told": judged}
+    return (generator, average, discriminator, (first, second)), {**parts, "discriminator": loss}
 
 
 def _optimiser() -> optax.GradientTransformation:
@@ -142,7 +142,7 @@ def _optimiser() -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(5.0), optax.adam(1.0, b1=0.5))
 
 
-def _initial(settings: Settings, crop: int, key: jax.Array) -> Any:
+def _init_state(settings: Settings, crop: int, key: jax.Array) -> Any:
     """Return the initial state of `_update`."""
     painter, judge = jax.random.split(key)
     blank = jnp.zeros((1, crop, crop, 3))
@@ -182,14 +182,14 @@ def train(
 
     def update(step: int, rates: tuple[jax.Array, jax.Array]) -> tuple[dict[str, jax.Array], Any]:
         nonlocal state
-        batch = crops(pool.examples, rng, plan.batch, plan.crop)
+        batch = sample_crops(pool.examples, rng, plan.batch, plan.crop)
         state, parts = _update(state, batch, jax.random.fold_in(steps_key, step), rates, settings, dtype)
         return parts, state[1]
 
     try:
-        state = _initial(settings, plan.crop, start_key)
+        state = _init_state(settings, plan.crop, start_key)
         pool.fill(plan.first)
-        step = repeat(update, pool, plan, started, report, report_interval)
+        step = run_updates(update, pool, plan, started, report, report_interval)
     finally:
         pool.close()
     return state[1], step

@@ -14,7 +14,7 @@ from jaxrl_vis.config import fields
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.weights_file import check_range, read_parameters, write_parameters
 from jaxrl_vis.stalks.grasping.masks.mask_networks import Generator
-from jaxrl_vis.stalks.grasping.perception.cloud import RED, redness
+from jaxrl_vis.stalks.grasping.perception.cloud import MASK_THRESHOLD, redness
 
 Loss = Literal["gan", "segmentation"]
 SHIPPED = Path(__file__).with_name("stalks_segmentation.safetensors")
@@ -37,7 +37,7 @@ class Settings:
 
     @property
     def multiple(self) -> int:
-        """Number of which height and width of an image must be multiples, pixels."""
+        """Divisor that the network requires of height and width of an image, pixels."""
         return 2 ** len(self.channels)
 
     def generator(self, dtype: Any) -> Generator:
@@ -50,7 +50,7 @@ _MAX_LEVELS = 10  # each level halves height and width
 
 
 def normalise(images: jax.Array) -> jax.Array:
-    """Convert images from uint8 to float32 in -1 to 1."""
+    """Convert images of any shape from uint8 to float32 in -1 to 1."""
     return images.astype(jnp.float32) / 127.5 - 1.0
 
 
@@ -86,7 +86,10 @@ class Painter:
         self._paint = jax.jit(paint)
 
     def paint(self, image: np.ndarray) -> np.ndarray:
-        """Return a copy of an image [H, W, 3] uint8 with the stalks of the near row in red."""
+        """Return a copy of an image [H, W, 3] uint8 with the stalks of the near row in red.
+
+        With loss ``gan`` the copy is the generator's output, which also differs slightly beside the stalks.
+        """
         result = self._run(image)
         if self.settings.loss == "gan":
             return result
@@ -97,7 +100,7 @@ class Painter:
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the mask [H, W] bool of the stalks of the near row in an image [H, W, 3] uint8."""
         result = self._run(image)
-        return redness(result) > RED if self.settings.loss == "gan" else result
+        return redness(result) > MASK_THRESHOLD if self.settings.loss == "gan" else result
 
     def _run(self, image: np.ndarray) -> np.ndarray:
         height, width = image.shape[:2]

@@ -14,7 +14,7 @@ from jaxrl_vis_envs.plants import Calibration, Pose
 from jaxrl_vis_envs.plants.cameras import looking_along_y
 from jaxrl_vis_envs.plants.family import Rig
 
-RED = 0.5
+MASK_THRESHOLD = 0.5
 """Threshold of `redness` above which a pixel counts as painted."""
 
 
@@ -51,20 +51,20 @@ class Cloud:
     Attributes:
         points: [H, W, 3] float32, in the robot frame of its own pair, m; NaN where there is no depth.
         depth: [H, W] float32, planar depth, m; NaN where there is none.
-        red: [H, W] bool, mask of stalks.
+        mask: [H, W] bool, mask of stalks.
     """
 
     points: np.ndarray
     depth: np.ndarray
-    red: np.ndarray
+    mask: np.ndarray
 
     def all_points(self) -> np.ndarray:
         """Return all points with a depth, [N, 3] float32, m."""
         return self.points[np.isfinite(self.depth)]
 
-    def red_points(self) -> np.ndarray:
+    def stalk_points(self) -> np.ndarray:
         """Return the points of stalks with a depth, [N, 3] float32, m."""
-        return self.points[self.red & np.isfinite(self.depth)]
+        return self.points[self.mask & np.isfinite(self.depth)]
 
 
 def redness(image: np.ndarray) -> np.ndarray:
@@ -77,7 +77,7 @@ def redness(image: np.ndarray) -> np.ndarray:
     return values[..., 0] - np.maximum(values[..., 1], values[..., 2])
 
 
-def match(left: np.ndarray, right: np.ndarray, calibration: Calibration, mount: Mount) -> np.ndarray:
+def compute_disparity(left: np.ndarray, right: np.ndarray, calibration: Calibration, mount: Mount) -> np.ndarray:
     """Compute the disparities of a whole pair by semi-global matching.
 
     Args:
@@ -97,9 +97,9 @@ def match(left: np.ndarray, right: np.ndarray, calibration: Calibration, mount: 
     matcher = cv2.StereoSGBM_create(
         minDisparity=low,
         numDisparities=count,
-        blockSize=_BLOCK,
-        P1=_SMALL_STEP * _BLOCK**2,
-        P2=_LARGE_STEP * _BLOCK**2,
+        blockSize=_BLOCK_SIZE,
+        P1=_SMALL_STEP * _BLOCK_SIZE**2,
+        P2=_LARGE_STEP * _BLOCK_SIZE**2,
         disp12MaxDiff=1,
         uniquenessRatio=5,
         preFilterCap=31,
@@ -109,17 +109,17 @@ def match(left: np.ndarray, right: np.ndarray, calibration: Calibration, mount: 
     return np.where(disparity >= low, disparity, np.float32(np.nan))
 
 
-_BLOCK = 5
+_BLOCK_SIZE = 5
 _SMALL_STEP, _LARGE_STEP = 4, 24
 """Smoothness penalties for disparity changes of one pixel and of more, per pixel of a block."""
 
 
-def organise(disparity: np.ndarray, red: np.ndarray, calibration: Calibration, mount: Mount) -> Cloud:
+def build_cloud(disparity: np.ndarray, mask: np.ndarray, calibration: Calibration, mount: Mount) -> Cloud:
     """Build the organised cloud of a pair; depths outside the mount's range become NaN.
 
     Args:
         disparity: [H, W] float32, pixels; NaN where there is none.
-        red: [H, W] bool, mask of stalks.
+        mask: [H, W] bool, mask of stalks.
         calibration: Calibration of the pair.
         mount: Mount of the pair.
     """
@@ -132,7 +132,7 @@ def organise(disparity: np.ndarray, red: np.ndarray, calibration: Calibration, m
     rays = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((height, width), np.float32)], axis=-1)
     pose = mount.pose
     points = rays @ pose.rotation.astype(np.float32) * depth[..., None] + pose.position.astype(np.float32)
-    return Cloud(points, depth, red)
+    return Cloud(points, depth, mask)
 
 
 def subsample(points: np.ndarray, size: float) -> np.ndarray:
@@ -143,7 +143,7 @@ def subsample(points: np.ndarray, size: float) -> np.ndarray:
         size: Edge of a voxel, m.
 
     Returns:
-        [V, 3], m.
+        [V, 3] float64, m.
     """
     if not len(points):
         return points

@@ -55,7 +55,7 @@ class GraspPoint:
 _LINE_RADIUS = 0.009  # m: maximum distance of a chord from its line
 _BENT_LENGTH = 0.3  # m: minimum height range of chords for fitting curvature or taper
 _USUAL_TAPER = -0.01  # m per m: taper of stalks with a smaller height range
-_OPENING = 0.03  # growth of the maximum distance per m beyond the known part of a line
+_RADIUS_GROWTH = 0.03  # growth of the maximum distance per m beyond the known part of a line
 _MIN_PIECE = 0.03  # m: minimum height range of a seed
 _MAX_SLOPE = 0.6  # m per m: maximum slope of a line against the vertical
 _BIN = 0.02  # m: bin width of heights
@@ -65,7 +65,7 @@ _AROUND = 0.2  # m: half height of the range around the grasp point in which vis
 _MIN_SHOWN = 4  # minimum number of places at which a pair must show a stalk
 _MIN_FRACTION = 0.4  # minimum fraction of places that show the stalk among those that show it or see through it
 _APART = 0.012  # m: lines nearer than this are the same stalk
-_BEND = 0.04  # growth of that distance per m between the heights of their grasp points
+_SEPARATION_GROWTH = 0.04  # growth of that distance per m between the heights of their grasp points
 _REST_WITHIN, _REST_SPREAD = 0.025, 0.003  # m: nearer lines with a greater spread are leftovers of the other stalk
 _LEVEL = 0.002  # m: chords of one pair that differ less in height are in the same image row
 _MIN_BESIDE, _FRACTION_BESIDE = 20, 0.2  # minimum number, and fraction, of chords of two distinct stalks that are side by side
@@ -80,8 +80,10 @@ class _Line(NamedTuple):
     shown: int
 
 
-def grasp_points(segments: StalkSegments, visibility: Visibility, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
-    """Detect stalks and return their grasp points, from left to right.
+def detect_grasp_points(
+    segments: StalkSegments, visibility: Visibility, heights: tuple[float, float] = HEIGHTS
+) -> list[GraspPoint]:
+    """Detect stalks and return their grasp points, in ascending order of x.
 
     Args:
         segments: Segments of all pairs, in the robot frame of the last one.
@@ -98,7 +100,7 @@ def grasp_points(segments: StalkSegments, visibility: Visibility, heights: tuple
         if not len(members):
             continue
         free[members] = False
-        point = _grasp(segments, members, min(2, len(visibility.clouds)), heights)
+        point = _make_grasp_point(segments, members, min(2, len(visibility.clouds)), heights)
         if point is None:
             continue
         count = _count_support(point, visibility)
@@ -110,8 +112,8 @@ def grasp_points(segments: StalkSegments, visibility: Visibility, heights: tuple
 
 def _seeds(segments: StalkSegments) -> list[np.ndarray]:
     """Return the indices of the chords of each piece with at least 5, tall pieces first."""
-    order = np.argsort(segments.piece, kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(segments.piece[order])) + 1) if len(order) else []
+    order = np.argsort(segments.component, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(segments.component[order])) + 1) if len(order) else []
     parts = [part for part in parts if len(part) >= 5]
     return sorted(parts, key=lambda part: -float(np.ptp(segments.middle[part, 2])))
 
@@ -137,13 +139,13 @@ def _fit(points: np.ndarray, weights: np.ndarray, bent: bool) -> tuple[np.ndarra
 
 
 def _offsets(points: np.ndarray, coefficients: np.ndarray, middle: float) -> np.ndarray:
-    """Return the horizontal distances [N] of points [N, 3] from a line, m."""
+    """Return the horizontal distances [N] of points [N, 3] from a line fitted by `_fit`, m."""
     height = points[:, 2] - middle
     powers = np.stack([np.ones_like(height), height, height**2][: len(coefficients)], axis=1)
     return np.linalg.norm(points[:, :2] - powers @ coefficients, axis=1)
 
 
-def _robust(points: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
+def _fit_robustly(points: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
     weights = np.ones(len(points))
     coefficients, middle = _fit(points, weights, bent)
     for _ in range(4):
@@ -160,12 +162,12 @@ def _grow(segments: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.
     for _ in range(6):
         known = segments.middle[members]
         low, high = known[:, 2].min(), known[:, 2].max()
-        coefficients, middle = _robust(known, bent=high - low > _BENT_LENGTH)
+        coefficients, middle = _fit_robustly(known, bent=high - low > _BENT_LENGTH)
         if np.abs(coefficients[1]).max() > _MAX_SLOPE:
             return members[:0]
         beyond = np.maximum(np.maximum(low - points[:, 2], points[:, 2] - high), 0.0)
         # Extrapolate by at most the known height range of the line, or 0.15 m.
-        near = _offsets(points, coefficients, middle) < _LINE_RADIUS + _OPENING * beyond
+        near = _offsets(points, coefficients, middle) < _LINE_RADIUS + _RADIUS_GROWTH * beyond
         near &= beyond < max(0.15, 1.0 * (high - low))
         grown = candidates[near]
         if len(grown) < 5 or (len(grown) == len(members) and (grown == members).all()):
@@ -182,10 +184,12 @@ def _support(segments: StalkSegments, members: np.ndarray) -> tuple[float, int]:
     return _BIN * len(occupied), int((counts >= 2).sum())
 
 
-def _grasp(segments: StalkSegments, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
-    """Return the grasp point of a stalk; None if the pairs show too little of it."""
+def _make_grasp_point(
+    segments: StalkSegments, members: np.ndarray, min_frames: int, heights: tuple[float, float]
+) -> GraspPoint | None:
+    """Return the grasp point of a stalk; None if the pairs show too little of it, or fewer than ``min_frames`` show it."""
     length, frames = _support(segments, members)
-    if length < _MIN_SUPPORT or frames < least_frames:
+    if length < _MIN_SUPPORT or frames < min_frames:
         return None
     points = segments.middle[members]
     places = np.arange(heights[0], heights[1] + 1e-9, _BIN)
@@ -195,12 +199,12 @@ def _grasp(segments: StalkSegments, members: np.ndarray, least_frames: int, heig
     if within[best].sum() < 8:
         return None
     near = np.flatnonzero(within[best])
-    local, middle = _robust(points[near], bent=False)
+    local, middle = _fit_robustly(points[near], bent=False)
     x, y = local[0] + local[1] * (places[best] - middle)
     spread = float(np.sqrt(np.mean(np.minimum(_offsets(points[near], local, middle), _LINE_RADIUS) ** 2)))
     thickness = float(np.median(segments.thickness[members[near]]))
     # Direction and curvature are fitted to the whole line.
-    curve, middle = _robust(points, bent=np.ptp(points[:, 2]) > _BENT_LENGTH)
+    curve, middle = _fit_robustly(points, bent=np.ptp(points[:, 2]) > _BENT_LENGTH)
     bend = curve[2] if len(curve) > 2 else np.zeros(2)
     direction = np.array([*(curve[1] + 2.0 * bend * (places[best] - middle)), 1.0])
     return GraspPoint(
@@ -210,12 +214,15 @@ def _grasp(segments: StalkSegments, members: np.ndarray, least_frames: int, heig
         frames,
         spread,
         (float(bend[0]), float(bend[1])),
-        _taper(points[:, 2], segments.thickness[members]),
+        _fit_taper(points[:, 2], segments.thickness[members]),
     )
 
 
-def _taper(heights: np.ndarray, thickness: np.ndarray) -> float:
-    """Estimate the change of the diameter per m of height from the medians of the lower and the upper half of the heights."""
+def _fit_taper(heights: np.ndarray, thickness: np.ndarray) -> float:
+    """Estimate the change of the diameter per m of height, from the medians of the lower and the upper half of the heights.
+
+    Return a default if the heights span less than 0.3 m, which does not suffice.
+    """
     if np.ptp(heights) < _BENT_LENGTH:
         return _USUAL_TAPER
     upper = heights > 0.5 * (heights.min() + heights.max())
@@ -240,7 +247,9 @@ def _remove_duplicates(lines: list[_Line], segments: StalkSegments) -> list[_Lin
     """Return the lines without those that are the same stalk as an earlier one."""
     distinct: list[_Line] = []
     for line in lines:
-        if not any(_is_same_stalk(line.point, other.point) and not _side_by_side(segments, line, other) for other in distinct):
+        if not any(
+            _is_same_stalk(line.point, other.point) and not _are_side_by_side(segments, line, other) for other in distinct
+        ):
             distinct.append(line)
     return distinct
 
@@ -250,18 +259,18 @@ def _is_same_stalk(point: GraspPoint, other: GraspPoint) -> bool:
     up = point.point[2] - other.point[2]
     distance = float(np.linalg.norm((point.point - other.at_height(point.point[2]))[:2]))
     # Chords left over from a stalk form a second line nearby, with a large spread.
-    return distance < _APART + _BEND * abs(up) or (distance < _REST_WITHIN and point.spread > _REST_SPREAD)
+    return distance < _APART + _SEPARATION_GROWTH * abs(up) or (distance < _REST_WITHIN and point.spread > _REST_SPREAD)
 
 
-def _side_by_side(segments: StalkSegments, one: _Line, other: _Line) -> bool:
+def _are_side_by_side(segments: StalkSegments, first: _Line, second: _Line) -> bool:
     """Return True if pairs show two lines side by side in the same image rows: these are distinct stalks, however near."""
     apart = [np.zeros(0)]
-    for frame in np.intersect1d(segments.frame[one.members], segments.frame[other.members]):
-        mine, theirs = (segments.middle[line.members[segments.frame[line.members] == frame]] for line in (one, other))
+    for frame in np.intersect1d(segments.frame[first.members], segments.frame[second.members]):
+        mine, theirs = (segments.middle[line.members[segments.frame[line.members] == frame]] for line in (first, second))
         theirs = theirs[np.argsort(theirs[:, 2])]
         place = np.searchsorted(0.5 * (theirs[1:, 2] + theirs[:-1, 2]), mine[:, 2])
         level = np.abs(theirs[place, 2] - mine[:, 2]) < _LEVEL
         apart.append(np.linalg.norm((theirs[place] - mine)[level, :2], axis=1))
     distances = np.concatenate(apart)
-    enough = max(_MIN_BESIDE, _FRACTION_BESIDE * min(len(one.members), len(other.members)))
+    enough = max(_MIN_BESIDE, _FRACTION_BESIDE * min(len(first.members), len(second.members)))
     return len(distances) >= enough and float(np.median(distances)) > _APART_BESIDE

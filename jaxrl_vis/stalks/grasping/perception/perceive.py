@@ -16,11 +16,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, match, organise
-from jaxrl_vis.stalks.grasping.perception.lines import GraspPoint, grasp_points
-from jaxrl_vis.stalks.grasping.perception.slices import slice_points
-from jaxrl_vis.stalks.grasping.perception.stalk_segments import join_segments, stalk_segments
-from jaxrl_vis.stalks.grasping.perception.stitch import DEFAULT, THESIS, Motion, Stitch, Thinned, stitch
+from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, build_cloud, compute_disparity
+from jaxrl_vis.stalks.grasping.perception.lines import GraspPoint, detect_grasp_points
+from jaxrl_vis.stalks.grasping.perception.slices import detect_by_slice
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import extract_stalk_segments, join_segments
+from jaxrl_vis.stalks.grasping.perception.stitch import DEFAULT, THESIS, DownsampledCloud, Motion, Stitch, stitch
 from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
 from jaxrl_vis_envs.plants import Calibration
 
@@ -64,9 +64,9 @@ class Perception:
     seconds: dict[str, float]
     notes: tuple[str, ...]
 
-    def red_points(self) -> np.ndarray:
+    def stalk_points(self) -> np.ndarray:
         """Return the points [N, 3] of stalks of all pairs, in the robot frame of the last one, m."""
-        return np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(self.to_last, self.clouds)])
+        return np.concatenate([motion(cloud.stalk_points()) for motion, cloud in zip(self.to_last, self.clouds)])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,15 +117,17 @@ def perceive(
         views, notes = views[-1:], ["no odometry: only the last pair was used"]
     with _threads(len(views)) as side_by_side:
         with clock("match"):
-            matched = side_by_side(lambda view: match(view.left, view.right, calibration, mount), views)
+            matched = side_by_side(lambda view: compute_disparity(view.left, view.right, calibration, mount), views)
             # Matching runs in threads while the network computes masks, perhaps on an accelerator.
             with clock("mask"):
                 painted = [mask(view.left, view.number) for view in views]
-            clouds = list(side_by_side(lambda disparity, red: organise(disparity, red, calibration, mount), matched, painted))
+            clouds = list(
+                side_by_side(lambda disparity, red: build_cloud(disparity, red, calibration, mount), matched, painted)
+            )
         with clock("stitch"):
             method = THESIS if variant.stitch else DEFAULT
-            thinned = list(side_by_side(lambda cloud: Thinned.of(cloud, method), clouds))
-            driven = [_driven(*neighbours) for neighbours in itertools.pairwise(views)]
+            thinned = list(side_by_side(lambda cloud: DownsampledCloud.of(cloud, method), clouds))
+            driven = [_distance_driven(*neighbours) for neighbours in itertools.pairwise(views)]
             stitches = list(
                 side_by_side(lambda here, there, far: stitch(here, there, far, method), thinned[:-1], thinned[1:], driven)
             )
@@ -139,19 +141,23 @@ def perceive(
             to_last.insert(0, to_last[0].after(step.motion))
         with clock("points"):
             if variant.points:
-                points = slice_points(np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(to_last, clouds)]))
+                points = detect_by_slice(
+                    np.concatenate([motion(cloud.stalk_points()) for motion, cloud in zip(to_last, clouds)])
+                )
             else:
                 segments = side_by_side(
-                    lambda cloud, frame: stalk_segments(cloud, calibration, mount, frame), clouds, range(len(clouds))
+                    lambda cloud, frame: extract_stalk_segments(cloud, calibration, mount, frame), clouds, range(len(clouds))
                 )
                 parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(to_last, segments)]
-                points = grasp_points(join_segments(parts), Visibility(tuple(clouds), tuple(to_last), calibration, mount))
+                points = detect_grasp_points(
+                    join_segments(parts), Visibility(tuple(clouds), tuple(to_last), calibration, mount)
+                )
     if not points:
         notes.append("no stalk was found")
     return Perception(tuple(clouds), tuple(stitches), tuple(to_last), points, seconds, tuple(notes))
 
 
-def _driven(view: View, next_view: View) -> float:
+def _distance_driven(view: View, next_view: View) -> float:
     """Return the distance that the robot drove between two pairs, m; 0 if it is not known."""
     return 0.0 if view.driven is None or next_view.driven is None else next_view.driven - view.driven
 

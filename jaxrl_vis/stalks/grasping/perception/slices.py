@@ -30,8 +30,9 @@ class Slice:
         low: Height of its lower side, m.
         corner: [2], x and y of the first cell's corner, m.
         heat: [X, Y] float64, smoothed number of points in each cell.
-        regions: [X, Y] int, number of the region from 1; 0 for cells that are not dense.
-        middles: [R, 3] float64, centre of each region that is large enough, m.
+        regions: [X, Y] int32, number of the region from 1; 0 for cells that are not dense.
+        middles: [R, 3] float64, mean position of the points in each region of at least two cells, at half the slice's height,
+            m.
     """
 
     low: float
@@ -64,8 +65,8 @@ def slice_at(points: np.ndarray, low: float) -> Slice:
     return Slice(low, corner, heat, regions, np.array(middles).reshape(-1, 3))
 
 
-def slice_points(points: np.ndarray) -> list[GraspPoint]:
-    """Detect grasp points in the slice around the preferred height, from left to right.
+def detect_by_slice(points: np.ndarray) -> list[GraspPoint]:
+    """Detect grasp points in the slice around the preferred height, in ascending order of x.
 
     Directions are vertical; thickness and spread are NaN, and the number of pairs is 0.
 

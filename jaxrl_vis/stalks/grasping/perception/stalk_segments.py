@@ -20,8 +20,8 @@ STEP = 3
 _JUMP = 0.02  # m: adjacent pixels whose depths differ by more are on different stalks
 _MIN_PIXELS = 3  # minimum length of a chord
 _BEHIND_FRONT = 0.9  # distance of the centre behind the matched front, relative to the radius
-_THICK = 0.035  # m: chords at least this long are not stalks
-_SIDEWAYS = 3.0  # pixels: maximum shift of a stalk from one processed row to the next
+_MAX_THICKNESS = 0.035  # m: chords at least this long are not stalks
+_MAX_SHIFT = 3.0  # pixels: maximum shift of a stalk from one processed row to the next
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,21 +32,21 @@ class StalkSegments:
         middle: [N, 3] float64, centre of the stalk at each chord in the robot's frame (`cloud`), m.
         thickness: [N] float64, diameter of the stalk, m.
         frame: [N] int, index of the pair.
-        piece: [N] int, number of the piece: chords of one pair that are connected from row to row.
+        component: [N] int, index of the connected component: chords of one pair that are connected from row to row.
     """
 
     middle: np.ndarray
     thickness: np.ndarray
     frame: np.ndarray
-    piece: np.ndarray
+    component: np.ndarray
 
     def __len__(self) -> int:
         return len(self.thickness)
 
 
-def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: int) -> StalkSegments:
-    """Return the chords of one pair, in its own robot frame; ``frame`` is the index of the pair."""
-    red, depth = cloud.red[::STEP], cloud.depth[::STEP]
+def extract_stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: int) -> StalkSegments:
+    """Return the chords of every `STEP`-th row of one pair, in its own robot frame; ``frame`` is the index of the pair."""
+    red, depth = cloud.mask[::STEP], cloud.depth[::STEP]
     with np.errstate(invalid="ignore"):
         jump = np.abs(np.diff(depth, axis=1)) > _JUMP
     begins = red.copy()
@@ -54,17 +54,17 @@ def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: 
     line, column = np.nonzero(red)
     first = np.flatnonzero(begins[line, column])
     if not first.size:
-        return _nothing()
+        return _empty_segments()
     last = np.append(first[1:], len(line)) - 1
     length = column[last] - column[first] + 1.0
     far = _middle_depth(depth[line, column], first, last)
     thickness = length * far / calibration.focal
-    good = (length >= _MIN_PIXELS) & np.isfinite(far) & (thickness < _THICK)
+    good = (length >= _MIN_PIXELS) & np.isfinite(far) & (thickness < _MAX_THICKNESS)
     line, far, thickness = line[first][good], far[good], thickness[good]
     across = (0.5 * (column[first] + column[last]))[good]
     if not len(line):
-        return _nothing()
-    piece = _pieces(line, across, far)
+        return _empty_segments()
+    piece = _split_runs(line, across, far)
     rays = np.stack(
         [
             (across - calibration.centre[0]) / calibration.focal,
@@ -77,25 +77,30 @@ def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: 
     return StalkSegments(mount.pose.to_world(points), thickness, np.full(len(line), frame), piece)
 
 
-def join_segments(parts: list[StalkSegments]) -> StalkSegments:
-    """Concatenate the chords of several pairs, all in one robot frame; pieces are renumbered to stay distinct."""
-    if not parts:
-        return _nothing()
-    counts = np.cumsum([0, *(int(part.piece.max(initial=-1)) + 1 for part in parts)])
+def join_segments(segments: list[StalkSegments]) -> StalkSegments:
+    """Concatenate the chords of several pairs, all in one robot frame; components are renumbered to stay distinct."""
+    if not segments:
+        return _empty_segments()
+    counts = np.cumsum([0, *(int(part.component.max(initial=-1)) + 1 for part in segments)])
     return StalkSegments(
-        np.concatenate([part.middle for part in parts]),
-        np.concatenate([part.thickness for part in parts]),
-        np.concatenate([part.frame for part in parts]),
-        np.concatenate([part.piece + count for part, count in zip(parts, counts)]),
+        np.concatenate([part.middle for part in segments]),
+        np.concatenate([part.thickness for part in segments]),
+        np.concatenate([part.frame for part in segments]),
+        np.concatenate([part.component + count for part, count in zip(segments, counts)]),
     )
 
 
-def _nothing() -> StalkSegments:
+def _empty_segments() -> StalkSegments:
     return StalkSegments(np.zeros((0, 3)), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
 
 
 def _middle_depth(depth: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Return the median depth of the inner half of each chord; NaN where less than half of it has a depth."""
+    """Return the median depth [C] float64 of the inner half of each chord, m; NaN where less than half of that has a depth.
+
+    Args:
+        depth: [P], depths of the masked pixels in row-major order, m; NaN where there is none.
+        first, last: [C] int, indices of the first and last pixel of each chord, both inclusive.
+    """
     count = last - first + 1
     inner = np.maximum(count // 4, 0)
     begin, end = first + inner, last - inner + 1
@@ -108,8 +113,14 @@ def _middle_depth(depth: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.
     return np.where(2 * valid >= end - begin, middle, np.nan).astype(np.float64)
 
 
-def _pieces(line: np.ndarray, positions: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Return the number of the piece of each chord [N]: connected components over neighbouring rows."""
+def _split_runs(line: np.ndarray, positions: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Return the number [N] of the piece of each chord: connected components over neighbouring rows.
+
+    Args:
+        line: [N] int, index of the processed row of each chord, ascending.
+        positions: [N], column of the middle of each chord, pixels.
+        depth: [N], depth of each chord, m.
+    """
     count = len(line)
     ends = np.searchsorted(line, np.arange(line.max() + 3))
     one, other = [], []
@@ -117,7 +128,7 @@ def _pieces(line: np.ndarray, positions: np.ndarray, depth: np.ndarray) -> np.nd
         upper, lower = np.arange(ends[here], ends[here + 1]), np.arange(ends[here + 1], ends[here + 2])
         if not (upper.size and lower.size):
             continue
-        near = np.abs(positions[upper, None] - positions[None, lower]) < _SIDEWAYS
+        near = np.abs(positions[upper, None] - positions[None, lower]) < _MAX_SHIFT
         near &= np.abs(depth[upper, None] - depth[None, lower]) < _JUMP
         rows, columns = np.nonzero(near)
         one.append(upper[rows])

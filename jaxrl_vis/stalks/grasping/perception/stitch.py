@@ -72,7 +72,7 @@ class Method:
     from_odometry: bool
     pixels: int = 1_000_000_000
 
-    def after_first_gate(self) -> "Method":
+    def without_first_gate(self) -> "Method":
         """Return the method without its first, widest gate."""
         return dataclasses.replace(self, gates=self.gates[1:], max_points=self.max_points[1:])
 
@@ -92,7 +92,7 @@ _ODOMETRY_FRACTION = 0.05
 _MAX_WOBBLE = 0.03  # m
 _MAX_TURN = math.radians(3.0)
 _MIN_OVERLAP = 0.2
-_STILL = 0.01  # tolerance of convergence relative to the gate, for translation in m and rotation in rad
+_CONVERGENCE = 0.01  # tolerance of convergence relative to the gate, for translation in m and rotation in rad
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,11 +112,11 @@ class Stitch:
     refused: str = ""
 
 
-class Thinned:
+class DownsampledCloud:
     """Cloud downsampled on the grid of a method.
 
     Attributes:
-        points: [N, 3], m.
+        points: [N, 3] float64, m.
     """
 
     def __init__(self, points: np.ndarray, method: Method = DEFAULT) -> None:
@@ -129,7 +129,7 @@ class Thinned:
         self.points = subsample(points, method.voxel)
 
     @classmethod
-    def of(cls, cloud: Cloud, method: Method = DEFAULT) -> "Thinned":
+    def of(cls, cloud: Cloud, method: Method = DEFAULT) -> "DownsampledCloud":
         """Downsample an organised cloud, from about ``method.pixels`` of its pixels."""
         part = slice(None, None, max(math.isqrt(cloud.depth.size // method.pixels), 1))
         return cls(cloud.points[part, part][np.isfinite(cloud.depth[part, part])], method)
@@ -140,23 +140,27 @@ class Thinned:
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 
-def stitch(source: Thinned, target: Thinned, distance: float, method: Method = DEFAULT) -> Stitch:
+def stitch(source: DownsampledCloud, target: DownsampledCloud, distance: float, method: Method = DEFAULT) -> Stitch:
     """Register the cloud of one pair with that of the next.
 
     Args:
         source, target: Clouds of the pair and the next one, each in its own robot frame.
         distance: Distance that the robot drove along the row between the pairs by its odometry, m.
         method: Method of stitching.
+
+    Returns:
+        The motion between the pairs' robot frames; that of the odometry if the result is refused or a cloud has fewer than 10
+        points.
     """
     prior = Motion.along(-distance)
     start = prior if method.from_odometry else Motion.along(0.0)
     if len(source.points) < 10 or len(target.points) < 10:
         return Stitch(prior, math.nan, 0.0, "a cloud is empty")
-    motion, residual, overlap = closest_points(source.points, target, start, method)
+    motion, residual, overlap = icp(source.points, target, start, method)
     refused = _rejection_reason(motion, prior, distance, overlap) if method.from_odometry else ""
     if refused and len(method.gates) > 1:
         # With little overlap, points of one pair alone bias the widest gate; the odometry may be good enough for the next one.
-        motion, residual, overlap = closest_points(source.points, target, start, method.after_first_gate())
+        motion, residual, overlap = icp(source.points, target, start, method.without_first_gate())
         refused = _rejection_reason(motion, prior, distance, overlap)
     return Stitch(prior if refused else motion, residual, overlap, refused)
 
@@ -176,7 +180,7 @@ def _rejection_reason(motion: Motion, prior: Motion, distance: float, overlap: f
     return ""
 
 
-def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: Method) -> tuple[Motion, float, float]:
+def icp(source: np.ndarray, target: DownsampledCloud, start: Motion, method: Method) -> tuple[Motion, float, float]:
     """Register points with a cloud by iterative closest points.
 
     Args:
@@ -187,12 +191,12 @@ def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: M
 
     Returns:
         The motion, the root mean square distance of corresponding points (m; NaN for fewer than 6), and the fraction of points
-        with a correspondence.
+        with a correspondence within the last gate that was applied.
     """
     motion, residual, overlap = start, math.nan, 0.0
     for gate, max_points in zip(method.gates, method.max_points):
         chosen = source[:: max(len(source) // max_points, 1)]
-        still = _STILL * gate if method.from_odometry else 1e-5
+        still = _CONVERGENCE * gate if method.from_odometry else 1e-5
         for _ in range(method.steps):
             moved = motion(chosen)
             distance, place = target.tree.query(moved, distance_upper_bound=gate)
@@ -203,15 +207,18 @@ def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: M
             residual = math.sqrt(float(np.mean(distance[close] ** 2)))
             # Distant correspondences weigh less: their points are probably visible in one of the two pairs only.
             weight = 1.0 / (1.0 + (distance[close] / (0.3 * gate)) ** 2) if method.from_odometry else np.ones(close.sum())
-            step = rigid(moved[close], target.points[place[close]], weight)
+            step = fit_rigid_motion(moved[close], target.points[place[close]], weight)
             motion = step.after(motion)
             if max(float(np.linalg.norm(step.shift)), step.angle) < still:
                 break
     return motion, residual, overlap
 
 
-def rigid(source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> Motion:
-    """Return the rigid motion from points [N, 3] to corresponding ones [N, 3], by least squares with weights [N]."""
+def fit_rigid_motion(source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> Motion:
+    """Fit the rigid motion from points [N, 3] to corresponding ones [N, 3], by least squares with weights [N].
+
+    Source: Kabsch (1976).
+    """
     weights = weight / weight.sum()
     here, there = weights @ source, weights @ target
     left, _, right = np.linalg.svd(((source - here) * weights[:, None]).T @ (target - there))

@@ -50,6 +50,6 @@ class Visibility:
             place = line[inside].astype(int), column[inside].astype(int)
             with np.errstate(invalid="ignore"):
                 behind = cloud.depth[place] - z[inside]
-                shown[frame, inside] = cloud.red[place] & (np.abs(behind) < _SAME)
+                shown[frame, inside] = cloud.mask[place] & (np.abs(behind) < _SAME)
                 through[frame, inside] = behind > _THROUGH
         return shown, through

@@ -40,33 +40,35 @@ def draw_figure(out: Path, family: Family, seed: int, mask: Mask | None, name: s
     figure.suptitle(f"From a stereo pair to grasp points (simulated; family {family.name}, seed {seed}, masks: {name})")
     # The constrained layout ignores the labels of 3D axes, so ``wspace`` leaves room for them.
     grid = figure.add_gridspec(2, 3, width_ratios=(1.0, 1.0, 1.25), wspace=0.1)
-    _image(figure.add_subplot(grid[0, 0]), scene, perception)
+    _draw_image(figure.add_subplot(grid[0, 0]), scene, perception)
     points = np.concatenate([motion(cloud.all_points()) for motion, cloud in zip(perception.to_last, perception.clouds)])
-    red = perception.red_points()
-    _cloud(figure.add_subplot(grid[0, 1], projection="3d"), points, red, "(a) stitched cloud, stalks in red")
-    _cloud(figure.add_subplot(grid[1, 0], projection="3d"), None, red, "(b) after the threshold")
-    _slice(figure.add_subplot(grid[0, 2]), figure.add_subplot(grid[1, 2]), red, scene, perception)
-    _cloud(figure.add_subplot(grid[1, 1], projection="3d"), None, red, "(d) grasp points", perception)
+    red = perception.stalk_points()
+    _draw_cloud(figure.add_subplot(grid[0, 1], projection="3d"), points, red, "(a) stitched cloud, stalks in red")
+    _draw_cloud(figure.add_subplot(grid[1, 0], projection="3d"), None, red, "(b) after the threshold")
+    _draw_slice(figure.add_subplot(grid[0, 2]), figure.add_subplot(grid[1, 2]), red, scene, perception)
+    _draw_cloud(figure.add_subplot(grid[1, 1], projection="3d"), None, red, "(d) grasp points", perception)
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=130)
     return perception
 
 
-def _image(axes: Any, scene: Scene, perception: Perception) -> None:
+def _draw_image(axes: Any, scene: Scene, perception: Perception) -> None:
     image = scene.views[-1].left.copy()
-    image[perception.clouds[-1].red] = (255, 0, 0)
+    image[perception.clouds[-1].mask] = (255, 0, 0)
     axes.imshow(image)
     axes.set_title("last left image, painted")
     axes.set_axis_off()
 
 
-def _cloud(axes: Any, points: np.ndarray | None, red: np.ndarray, title: str, perception: Perception | None = None) -> None:
+def _draw_cloud(
+    axes: Any, points: np.ndarray | None, red: np.ndarray, title: str, perception: Perception | None = None
+) -> None:
     rng = np.random.default_rng(0)
     if points is not None:
-        x, y, z = _shown(points)[rng.integers(len(_shown(points)), size=_MAX_POINTS)].T
+        x, y, z = _limit_points(points)[rng.integers(len(_limit_points(points)), size=_MAX_POINTS)].T
         axes.scatter(x, y, z, s=0.8, c="#6f8f5a", alpha=0.5, linewidths=0)
     if len(red):
-        x, y, z = _shown(red)[rng.integers(len(_shown(red)), size=_MAX_POINTS)].T
+        x, y, z = _limit_points(red)[rng.integers(len(_limit_points(red)), size=_MAX_POINTS)].T
         pale = perception is not None
         axes.scatter(x, y, z, s=0.6, c="#e8b0b0" if pale else "#d62728", linewidths=0)
     if perception is not None and perception.points:
@@ -80,12 +82,12 @@ def _cloud(axes: Any, points: np.ndarray | None, red: np.ndarray, title: str, pe
     axes.view_init(elev=12, azim=-75)
 
 
-def _shown(points: np.ndarray) -> np.ndarray:
+def _limit_points(points: np.ndarray) -> np.ndarray:
     """Return the points [N, 3] within the limits of the axes."""
     return points[((points > _LOW) & (points < _HIGH)).all(axis=1)]
 
 
-def _slice(above: Any, below: Any, red: np.ndarray, scene: Scene, perception: Perception) -> None:
+def _draw_slice(above: Any, below: Any, red: np.ndarray, scene: Scene, perception: Perception) -> None:
     """Draw the heat map of a slice ``above``, and its regions with their centres and those of the true stalks ``below``."""
     slice_ = slice_at(red, PREFERRED - 0.5 * THICKNESS)
     size = np.array(slice_.heat.shape) * CELL

@@ -12,7 +12,7 @@ from jaxrl_vis.host.worker_pool import Record
 from jaxrl_vis.report.plots import FAINT, INK
 from jaxrl_vis.stalks.grasping.arm.approach import reachable
 from jaxrl_vis.stalks.grasping.arm.reach import reach
-from jaxrl_vis.stalks.grasping.evaluation.attempts import follow, plan, wind_keys
+from jaxrl_vis.stalks.grasping.evaluation.attempts import plan, redetecting_observer, wind_keys
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Score
 from jaxrl_vis.stalks.grasping.evaluation.records import Reaches, attempts_in, grasp_score
 from jaxrl_vis.stalks.grasping.evaluation.scoring import draw_scene, score_scene
@@ -53,7 +53,7 @@ def draw_reach(
     if not len(sent):
         raise RequestError(f"there is nothing that the arm can be sent to in run {seed}: choose another --seed")
     keys = wind_keys(np.full(len(made.targets), seed), np.arange(len(made.targets)))
-    look = follow(made.stands, made.stalks, made.again)
+    look = redetecting_observer(made.stands, made.stalks, made.redetection_errors)
     result = reach(made.stands, made.targets, keys, wind_mm, sides=made.sides, observer=look)
     draw_path(out, made.stands, made.targets, result, int(sent[len(sent) // 2]))
     if video is not None:
@@ -97,7 +97,7 @@ def draw_grasps(out: Path, records: Sequence[Record], name: str, score: Score, t
     Args:
         out: Path of the figure.
         records: Records of the runs.
-        name: Kind of reaches, as named in the records.
+        name: Name of the reaches in the records, the string of their `Reaches`.
         score: Score of these reaches.
         title: Description of the simulation, below the heading.
 
@@ -107,7 +107,7 @@ def draw_grasps(out: Path, records: Sequence[Record], name: str, score: Score, t
     figure = Figure(figsize=(11.0, 5.6), dpi=150, facecolor="white")
     axes = figure.add_axes((0.07, 0.13, 0.58, 0.7))
     x = np.arange(len(records))
-    stalks, attempted, alone, others = np.array([_counts(record, name) for record in records]).T
+    stalks, attempted, alone, others = np.array([_count_outcomes(record, name) for record in records]).T
     axes.bar(x - 0.28, stalks, 0.26, color=_LOST, label="stalks in the half metre")
     axes.bar(x, attempted, 0.26, color="#2b6cb0", label="attempts: the arm was sent")
     axes.bar(x + 0.28, alone, 0.26, color=_HELD, label="grasped: exactly the target held")
@@ -125,7 +125,7 @@ def draw_grasps(out: Path, records: Sequence[Record], name: str, score: Score, t
     figure.savefig(out)
 
 
-def _counts(record: Record, name: str) -> tuple[int, int, int, int]:
+def _count_outcomes(record: Record, name: str) -> tuple[int, int, int, int]:
     """Count the stalks of a run, attempts sent, those that hold exactly their target, and stalks held in the others."""
     attempts = [attempt for attempt in attempts_in(record, name) if attempt.sent]
     alone = sum(attempt.outcome == "success" for attempt in attempts)
@@ -142,11 +142,11 @@ def _draw_proportions(figure: Figure, score: Score) -> None:
         ("all stalks", score.of_all),
     ]
     for place, (_, proportion) in enumerate(rows):
-        if proportion.of:
+        if proportion.total:
             low, high = proportion.interval
             axes.plot([100 * low, 100 * high], [place, place], color=_HELD, linewidth=2)
             axes.plot(100 * proportion.value, place, "o", color=_HELD)
-            axes.text(101, place - 0.22, f"{proportion.count} of {proportion.of}", fontsize=7, color=FAINT, ha="right")
+            axes.text(101, place - 0.22, f"{proportion.count} of {proportion.total}", fontsize=7, color=FAINT, ha="right")
     place = len(rows)
     axes.plot(100 * score.thesis_ratio, place, "s", color="#2b6cb0")
     axes.plot(100 * THESIS_RATIO, place + 1, "D", color=_OTHER)

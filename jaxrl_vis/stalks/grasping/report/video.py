@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 import jaxrl_vis_envs
 from jaxrl_vis.report.videos import BACKGROUND, HOLD, MISSED, REACHED, TEXT, check_output, write_images
 from jaxrl_vis.stalks.grasping.arm.control import Timing
-from jaxrl_vis.stalks.grasping.arm.reach import ReachResult, arms_among
+from jaxrl_vis.stalks.grasping.arm.reach import ReachResult, build_arm_model
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.plants import bending
 from jaxrl_vis_envs.plants.bending import Shape
@@ -58,18 +58,18 @@ def write_reaches(
 def reach_frames(stands: Stands, result: ReachResult, index: int, size: int) -> np.ndarray:
     """Render the camera's view of one reach: [F, size, size, 3] uint8, ``2 * result.interval`` s apart."""
     shape = jax.tree.map(lambda part: part[index], bending.shapes(stands))
-    draw = _program(stands.stalk.shape[1], size)
+    draw = _compile_drawing(stands.stalk.shape[1], size)
     return np.stack([np.asarray(draw(shape, pose)) for pose in result.poses[index, ::_EVERY]])
 
 
 @functools.cache
-def _program(stalks: int, size: int) -> Any:
-    arms = arms_among(stalks)
+def _compile_drawing(stalks: int, size: int) -> Any:
+    arms = build_arm_model(stalks)
     scene = Scene.from_mjmodel(arms.mj_model, "work", size, size)
     geoms = np.concatenate([arms.layout.lower_geom, arms.layout.upper_geom])
 
     def draw(shape: Shape, pose: jax.Array) -> jax.Array:
-        model = bending.fit(arms.model, arms.layout, shape)
+        model = bending.set_stalk_properties(arms.model, arms.layout, shape)
         data = mjx_model.kinematics(model, bending.place_stands(arms.rest, arms.layout, shape).replace(qpos=pose))
         fitted = scene.replace(size=scene.size.at[geoms].set(model.geom_size[geoms]))
         rgb = render_planes(fitted, data, depth=False, quantized=True).rgb
@@ -80,7 +80,7 @@ def _program(stalks: int, size: int) -> Any:
 
 
 def _outcome_caption(time: float, held_stalks: set[int], is_alone: bool) -> str:
-    """Return a caption of the arm's action at a time, s."""
+    """Return a caption of the arm's phase at a ``time`` (s), or of the outcome once the jaws are closed."""
     timing = Timing()
     if time < timing.turn:
         return "turns"

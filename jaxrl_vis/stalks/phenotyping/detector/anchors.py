@@ -15,24 +15,27 @@ _MAX_LOG_SIZE = 2.0  # clip of the log size ratio, against overflow
 _UNIT = np.array([0.2, 0.1, 0.3, 0.1, 0.3, 0.3], np.float32)  # approximate standard deviations of the offsets
 
 
-def make_anchors(shape: tuple[int, int], heights: float, widths: tuple[float, ...]) -> np.ndarray:
+def make_anchors(shape: tuple[int, int], height: float, widths: tuple[float, ...]) -> np.ndarray:
     """Return the anchors [K, 6] float32 of an image, in the order of `Detector.propose`.
 
     Args:
         shape: Height and width of the image, multiples of `PADDING`.
-        heights: Height of all anchors (that of the band), pixels.
+        height: Height of all anchors (that of the band), pixels.
         widths: Widths of the anchors at each location, pixels.
     """
     lines, columns = (-(-length // stride) for length, stride in zip(shape, ANCHOR_STRIDE))
     y = (np.arange(lines) + 0.5) * ANCHOR_STRIDE[0]
     x = (np.arange(columns) + 0.5) * ANCHOR_STRIDE[1]
     y, x, wide = np.meshgrid(y, x, np.asarray(widths), indexing="ij")
-    half = 0.5 * heights
+    half = 0.5 * height
     return np.stack([x - wide / 2, y - half, x + wide / 2, y + half, x, x], axis=-1).reshape(-1, 6).astype(np.float32)
 
 
 def encode(stalks: jax.Array, anchors: jax.Array) -> jax.Array:
-    """Encode stalks [..., 6] as box offsets [..., 6] relative to the reference boxes ``anchors`` [..., 6]."""
+    """Encode stalks [..., 6] as box offsets [..., 6] relative to the reference boxes ``anchors`` [..., 6].
+
+    Offsets are divided by their approximate standard deviations, so that the losses weight all six alike.
+    """
     middle, size = _middle_and_size(anchors)
     own_middle, own_size = _middle_and_size(stalks)
     axis = (stalks[..., 4:] - anchors[..., 4:]) / size[..., :1]

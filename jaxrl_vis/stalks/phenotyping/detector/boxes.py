@@ -13,7 +13,7 @@ def area(boxes: jax.Array) -> jax.Array:
     return jnp.prod(jnp.maximum(boxes[..., 2:] - boxes[..., :2], 0.0), axis=-1)
 
 
-def overlap(first: jax.Array, second: jax.Array) -> jax.Array:
+def box_iou(first: jax.Array, second: jax.Array) -> jax.Array:
     """Compute the intersection over union [N, M] of boxes [N, 4] and [M, 4]; 0 if both are empty."""
     low = jnp.maximum(first[:, None, :2], second[None, :, :2])
     high = jnp.minimum(first[:, None, 2:], second[None, :, 2:])
@@ -22,7 +22,9 @@ def overlap(first: jax.Array, second: jax.Array) -> jax.Array:
     return jnp.where(union > 0.0, common / jnp.where(union > 0.0, union, 1.0), 0.0)
 
 
-def suppress(overlaps: jax.Array, scores: jax.Array, threshold: float, valid: jax.Array | None = None) -> jax.Array:
+def non_maximum_suppression(
+    overlaps: jax.Array, scores: jax.Array, threshold: float, valid: jax.Array | None = None
+) -> jax.Array:
     """Apply greedy non-maximum suppression.
 
     In descending order of score, each kept box removes those that overlap it by more than the threshold.
@@ -48,15 +50,15 @@ def suppress(overlaps: jax.Array, scores: jax.Array, threshold: float, valid: ja
         selected, before = state
         return (selected != before).any()
 
-    def again(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def step(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         selected, _ = state
         return there & ~(better & selected[:, None]).any(axis=0), selected
 
-    selected, _ = jax.lax.while_loop(is_unsettled, again, again((there, ~there)))
+    selected, _ = jax.lax.while_loop(is_unsettled, step, step((there, ~there)))
     return jnp.zeros(scores.shape, bool).at[order].set(selected)
 
 
-def band_overlap(first: jax.Array, second: jax.Array, lines: int = 8) -> jax.Array:
+def strip_overlap(first: jax.Array, second: jax.Array, lines: int = 8) -> jax.Array:
     """Compute the overlap [N, M] of stalks: intersection over union of their slanted strips instead of their boxes.
 
     The boxes of two parallel leaning stalks can overlap by half although the stalks are apart; their strips do not. Strips are

@@ -10,12 +10,12 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.anchors import decode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import (
-    band_overlap,
+    non_maximum_suppression,
     roi_align,
     roi_columns,
     roi_rows,
     strip_half_width,
-    suppress,
+    strip_overlap,
 )
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import ANCHOR_STRIDE, PADDING, STRIDE, Detector
 from jaxrl_vis.stalks.phenotyping.detector.sections import decode_sections, section_anchors
@@ -111,7 +111,7 @@ class Settings:
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
+class DetectorOutput:
     """Stalks detected in a resized image, in descending order of score and padded. Registered as a pytree.
 
     Attributes:
@@ -127,7 +127,7 @@ class Found:
     pooled: jax.Array | None = None
 
 
-jax.tree_util.register_dataclass(Found, ["stalks", "scores", "valid", "pooled"], [])
+jax.tree_util.register_dataclass(DetectorOutput, ["stalks", "scores", "valid", "pooled"], [])
 
 
 def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
@@ -141,7 +141,7 @@ def normalise(images: jax.Array) -> jax.Array:
     return 2.0 * jnp.sqrt(images.astype(jnp.float32) / 255.0) - 1.0
 
 
-def region_features(features: jax.Array, stalks: jax.Array, section: int = 0) -> jax.Array:
+def pool_regions(features: jax.Array, stalks: jax.Array, section: int = 0) -> jax.Array:
     """Pool features [H, W, C] of an image along stalks [R, 6] to [R, *GRID, C].
 
     A region follows the axis, so that a leaning stalk stands upright in it: in a clump, two stalks that lean differently have
@@ -169,7 +169,7 @@ def region_features(features: jax.Array, stalks: jax.Array, section: int = 0) ->
     return roi_align(features, boxes, GRID, scale, samples=2, aligned=True, lean=bottom - top)
 
 
-def best_proposals(
+def select_proposals(
     logits: jax.Array, codes: jax.Array, anchors: jax.Array, settings: Settings, shape: tuple[int, int]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Select the best proposals of one image after non-maximum suppression.
@@ -189,7 +189,7 @@ def best_proposals(
     scores, places = jax.lax.top_k(logits, count)
     stalks = clip_to_image(decode(codes[places], anchors[places]), shape)
     size = stalks[:, 2:4] - stalks[:, :2]
-    selected = suppress(band_overlap(stalks, stalks), scores, settings.proposal_threshold)
+    selected = non_maximum_suppression(strip_overlap(stalks, stalks), scores, settings.proposal_threshold)
     selected &= (size[:, 0] > 2.0) & (size[:, 1] > 8.0)
     scores = jnp.where(selected, scores, -jnp.inf)
     best, places = jax.lax.top_k(scores, min(settings.proposals, count))
@@ -214,12 +214,12 @@ def section_proposals(
     count = min(max(settings.candidates // bands, 1), each)
     scores, places = jax.lax.top_k(logits.reshape(bands, each), count)
 
-    def of_band(scores, places, codes, anchors):
+    def select_in_band(scores, places, codes, anchors):
         stalks = decode_sections(codes[places], anchors[places])
-        selected = suppress(band_overlap(stalks, stalks, 4), scores, settings.proposal_threshold)
+        selected = non_maximum_suppression(strip_overlap(stalks, stalks, 4), scores, settings.proposal_threshold)
         return stalks, jnp.where(selected & (stalks[:, 2] - stalks[:, 0] > 2.0), scores, -jnp.inf)
 
-    stalks, scores = jax.vmap(of_band)(scores, places, codes.reshape(bands, each, 6), anchors)
+    stalks, scores = jax.vmap(select_in_band)(scores, places, codes.reshape(bands, each, 6), anchors)
     best, places = jax.lax.top_k(scores.reshape(-1), min(settings.proposals, bands * count))
     return stalks.reshape(-1, 6)[places], places // count, jnp.isfinite(best)
 
@@ -233,10 +233,20 @@ def clip_to_image(stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
     return jnp.stack([jnp.clip(left, 0.0, shape[1]), first, jnp.clip(right, 0.0, shape[1]), last, *axis], axis=-1)
 
 
-def heads(
+def apply_heads(
     network: Detector, params: Any, features: jax.Array, method: Literal["propose", "classify"]
 ) -> tuple[jax.Array, jax.Array]:
-    """Apply one of the heads of the detector and return its logits and box offsets."""
+    """Apply one of the heads of the detector, and return its logits and box offsets.
+
+    Args:
+        network: Detector.
+        params: Parameters of the detector.
+        features: Features [N, h, w, C] of images for ``propose``, pooled features [R, h, w, C] of regions for ``classify``.
+        method: Head, a method of `Detector`.
+
+    Returns:
+        Logits [N, K] float32 and box offsets [N, K, 6] float32 of the anchors, or [R] and [R, 6] of the regions.
+    """
     logits, codes = network.apply(params, features, method=method)
     assert isinstance(logits, jax.Array) and isinstance(codes, jax.Array)
     return logits, codes
@@ -244,20 +254,32 @@ def heads(
 
 def classify_proposals(
     network: Detector, params: Any, features: jax.Array, proposals: jax.Array, valid: jax.Array, settings: Settings
-) -> Found:
-    """Score and refine proposals [P, 6] of one image with features [H, W, C], and remove duplicates."""
-    regions = region_features(features, proposals, settings.section)
-    logits, codes = heads(network, params, regions, "classify")
+) -> DetectorOutput:
+    """Score and refine proposals of one image, and remove duplicates.
+
+    Args:
+        network: Detector.
+        params: Parameters of the detector.
+        features: Features [h, w, C] of the image.
+        proposals: [P, 6], pixels.
+        valid: [P] bool, False for padding.
+        settings: Thresholds, the maximum number of stalks, and the height of sections.
+
+    Returns:
+        At most ``settings.max_stalks`` stalks or sections, without pooled features.
+    """
+    regions = pool_regions(features, proposals, settings.section)
+    logits, codes = apply_heads(network, params, regions, "classify")
     scores = jax.nn.sigmoid(logits)
     stalks = (decode_sections if settings.section else decode)(codes, proposals)
     valid = valid & (scores >= settings.min_score)
-    selected = suppress(band_overlap(stalks, stalks), jnp.where(valid, scores, -1.0), settings.threshold, valid)
+    selected = non_maximum_suppression(strip_overlap(stalks, stalks), jnp.where(valid, scores, -1.0), settings.threshold, valid)
     best, places = jax.lax.top_k(jnp.where(selected, scores, -1.0), min(settings.max_stalks, scores.shape[0]))
-    return Found(stalks[places], jnp.maximum(best, 0.0), best > 0.0)
+    return DetectorOutput(stalks[places], jnp.maximum(best, 0.0), best > 0.0)
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
-def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.float32) -> Found:
+def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.float32) -> DetectorOutput:
     """Detect the stalks in one image, or their sections.
 
     Args:
@@ -265,18 +287,21 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
         image: [H, W, 3] uint8, resized, and padded to multiples of `PADDING`.
         settings: Settings of the networks; static under jit.
         dtype: Compute dtype of the convolutions; static under jit.
+
+    Returns:
+        Stalks in pixels of ``image``, down to ``settings.min_score``, with pooled features.
     """
     network = settings.detector(dtype)
     shape = (image.shape[0], image.shape[1])
     features = network.apply(params, normalise(image)[None], method="features")
     assert isinstance(features, jax.Array)
-    logits, codes = heads(network, params, features, "propose")
+    logits, codes = apply_heads(network, params, features, "propose")
     if settings.section:
         anchors = jnp.asarray(section_anchors(shape, settings.section, settings.anchor_widths))
         proposals, _, valid = section_proposals(logits[0], codes[0], anchors, settings)
     else:
         anchors = jnp.asarray(make_anchors(shape, settings.band_height, settings.anchor_widths))
-        proposals, _, valid = best_proposals(logits[0], codes[0], anchors, settings, shape)
+        proposals, _, valid = select_proposals(logits[0], codes[0], anchors, settings, shape)
     detected = classify_proposals(network, params, features[0], proposals, valid, settings)
     return dataclasses.replace(detected, pooled=_pool_features(features[0], image))
 
@@ -291,14 +316,14 @@ def _pool_features(features: jax.Array, image: jax.Array) -> jax.Array:
 
 
 def init_detector(settings: Settings, key: jax.Array) -> Any:
-    """Initialise the parameters of a detector at random."""
+    """Initialise the parameters of a detector at random, as nested dictionaries of float32 arrays."""
     images = jax.ShapeDtypeStruct((1, 2 * PADDING, 2 * PADDING, 3), jnp.float32)
     regions = jax.ShapeDtypeStruct((1, *GRID, settings.channels[2]), jnp.float32)
     # Lazily: this avoids running the network, whose operations would be compiled one by one.
     return settings.detector().lazy_init(key, images, regions)
 
 
-def pad(image: np.ndarray) -> np.ndarray:
-    """Pad an image [h, w, 3] with zeros at the bottom and on the right, to multiples of `PADDING`."""
+def pad_image(image: np.ndarray) -> np.ndarray:
+    """Pad an image [h, w, 3] with zeros at the bottom and on the right, to multiples of `PADDING` in height and width."""
     lines, columns = padded_shape(image.shape[:2])
     return np.pad(image, ((0, lines - image.shape[0]), (0, columns - image.shape[1]), (0, 0)))

@@ -13,11 +13,18 @@ STRIDE = (8, 4)
 ANCHOR_STRIDE = (16, 4)
 """Vertical and horizontal stride of the anchors, pixels."""
 PADDING = 32
-"""Number of which the height and width of an image must be multiples."""
+"""Divisor of the height and width that an image must have, pixels: the largest stride of the backbone."""
 
 
 class Block(nn.Module):
-    """Residual block of two convolutions with group normalisation."""
+    """Residual block of two convolutions with group normalisation.
+
+    Attributes:
+        channels: Number of output channels, a multiple of 8.
+        kernel: Height and width of both kernels.
+        strides: Vertical and horizontal stride of the first convolution.
+        dtype: Compute dtype.
+    """
 
     channels: int
     kernel: tuple[int, int] = (3, 3)
@@ -26,7 +33,7 @@ class Block(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Apply the block to features [N, H, W, C]."""
+        """Apply the block to features [N, H, W, C], and return [N, H / strides[0], W / strides[1], channels], rounded up."""
         y = nn.Conv(self.channels, self.kernel, self.strides, dtype=self.dtype, use_bias=False)(x)
         y = nn.relu(nn.GroupNorm(num_groups=None, group_size=8, dtype=self.dtype)(y))
         y = nn.Conv(self.channels, self.kernel, dtype=self.dtype, use_bias=False)(y)
@@ -82,8 +89,8 @@ class Detector(nn.Module):
         coarse = x
         for block in self.coarsest:
             x = block(x)
-        up = _twice(self.lateral[0](x)) + self.lateral[1](coarse)
-        return self.merge(middle + _twice(up))
+        up = _upsample(self.lateral[0](x)) + self.lateral[1](coarse)
+        return self.merge(middle + _upsample(up))
 
     def propose(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return objectness logits [N, K] and box offsets [N, K, 6] of all anchors, in row-major order."""
@@ -102,15 +109,17 @@ class Detector(nn.Module):
         return self.judge(x)[:, 0], self.refine(x)
 
     def __call__(self, images: jax.Array, regions: jax.Array) -> tuple[jax.Array, ...]:
-        """Run all parts once, for initialisation."""
+        """Run all parts once, for initialisation, and return the outputs of `features`, `propose` and `classify`."""
         features = self.features(images)
         return (features, *self.propose(features), *self.classify(regions))
 
 
 class Segmenter(nn.Module):
-    """Small U-Net from stalk crops [N, H, W, 3] (see `stalk_crops.smoothed`) to logits [N, H, W] of the stalk in the centre.
+    """Small U-Net from stalk crops [N, H, W, 3] to logits [N, H, W] of the stalk in the centre.
 
-    H and W must be multiples of 8.
+    Attributes:
+        channels: Channels of each level, multiples of 8.
+        dtype: Compute dtype of the convolutions.
     """
 
     channels: tuple[int, ...] = (16, 32, 48, 64)
@@ -118,7 +127,7 @@ class Segmenter(nn.Module):
 
     @nn.compact
     def __call__(self, crops: jax.Array) -> jax.Array:
-        """Return mask logits [N, H, W] of stalk crops [N, H, W, 3]."""
+        """Return mask logits [N, H, W] float32 of stalk crops [N, H, W, 3], preprocessed by `stalk_crops.preprocess_crops`."""
         x = crops.astype(self.dtype)
         across = jnp.linspace(-1.0, 1.0, x.shape[2], dtype=self.dtype)
         # The horizontal distance from the centre tells the network which stalk is meant.
@@ -138,6 +147,6 @@ class Segmenter(nn.Module):
         return nn.Conv(1, (3, 3), dtype=jnp.float32, bias_init=nn.initializers.constant(-1.0))(x)[..., 0]
 
 
-def _twice(x: jax.Array) -> jax.Array:
+def _upsample(x: jax.Array) -> jax.Array:
     """Upsample by a factor of 2, by repeating each row and column."""
     return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)

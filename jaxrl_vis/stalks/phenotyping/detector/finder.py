@@ -11,20 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, covered, cut_chain, link
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, pad
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, pad_image
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.doubles import suppress_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.gate import Gate
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, paste, preprocess_crops
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut_crops, paste_crop, preprocess_crops
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, find_frame
-from jaxrl_vis.stalks.phenotyping.measure.width import Strip, strip_width
+from jaxrl_vis.stalks.phenotyping.measure.width import Strip, fit_strip
 from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
 
 _BATCH, _BATCH_ON_ACCELERATOR = 8, 32  # stalk crops per batch
-_SHOWN = 0.5  # minimum fraction of a stalk's axis outside black borders
+_MIN_VISIBLE = 0.5  # minimum fraction of a stalk's axis outside black borders
 _MAX_ENLARGED = 3.0  # at more, a stalk is only three pixels wide and cannot be recognised
 _COVERED = 0.3  # minimum fraction of the band that the sections of a stalk cover
-_STRETCH = 1.12  # range of stretching in training: the networks accept image heights within this factor
+_MAX_STRETCH = 1.12  # range of stretching in training: the networks accept image heights within this factor
 
 
 Band = Callable[[float], tuple[float, float]]
@@ -69,15 +69,15 @@ class Detections(list[Detection]):
         self.doubt = doubt
 
 
-UPPER = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
+UPPER_OFFSET = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
 """Distance from the middle of the band up to the upper height, as a multiple of the height of the band."""
 
 
 def upper_segment(stalk: np.ndarray) -> np.ndarray:
-    """Extrapolate a stalk [6] in the band along its axis to its segment [6] around the upper height, of half its height."""
+    """Extrapolate a stalk [6] in the band along its axis to the segment [6] float32 around the upper height, half as tall."""
     left, top, right, bottom, above, below = stalk
     tall = bottom - top
-    middle = 0.5 * (top + bottom) - UPPER * tall
+    middle = 0.5 * (top + bottom) - UPPER_OFFSET * tall
     slope = (below - above) / max(tall, 1.0)
     first, last = middle - 0.25 * tall, middle + 0.25 * tall
     ends = [above + slope * (line - top) for line in (first, last)]
@@ -104,7 +104,8 @@ def resize(image: np.ndarray, settings: Settings, pixels_per_metre: float | None
         pixels_per_metre: Resolution of the image at the row; None if unknown.
 
     Returns:
-        Resized image, and the vertical and horizontal scale factors from its coordinates to those of the original.
+        Resized image (``image`` itself if its size does not change), and the vertical and horizontal scale factors from its
+        coordinates to those of the original.
     """
     height, across = image.shape[:2]
     factor = resize_factor(across, settings, pixels_per_metre)
@@ -130,7 +131,7 @@ def pad_to_training_height(image: np.ndarray, settings: Settings) -> tuple[np.nd
         Image, and the number of rows added at the top, negative if cropped.
     """
     beyond = settings.lines - image.shape[0]
-    if 1.0 / _STRETCH <= image.shape[0] / settings.lines <= _STRETCH:
+    if 1.0 / _MAX_STRETCH <= image.shape[0] / settings.lines <= _MAX_STRETCH:
         return image, 0
     above = beyond // 2
     if beyond < 0:
@@ -138,7 +139,7 @@ def pad_to_training_height(image: np.ndarray, settings: Settings) -> tuple[np.nd
     return np.pad(image, ((above, beyond - above), (0, 0), (0, 0))), above
 
 
-def in_image(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
+def to_image_coordinates(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
     """Convert stalks [N, 6] from coordinates of the resized image to those of the original; ``scale`` as from `resize`."""
     return stalks * np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
 
@@ -189,9 +190,9 @@ class Finder:
         frame = find_frame(image)
         detections = self._find(fill_borders(image, frame), pixels_per_metre, frame, band)
         ordered = sorted(detections, key=lambda detection: sum(detection.axis))
-        return Detections((_in_whole_image(detection, frame) for detection in ordered), doubt=detections.doubt)
+        return Detections((_to_full_image(detection, frame) for detection in ordered), doubt=detections.doubt)
 
-    def look(
+    def detect_boxes(
         self, image: np.ndarray, pixels_per_metre: float | None, band: Band | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Detect stalks without segmenting them.
@@ -210,34 +211,37 @@ class Finder:
         added = 0
         if pixels_per_metre and settings.pixels_per_metre and not settings.section:
             reduced, added = pad_to_training_height(reduced, settings)
-        detected = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
+        detected = jax.device_get(detect(self._params["detector"], pad_image(reduced), settings, self.dtype))
         assert detected.pooled is not None
         if settings.section:
             chains = link(detected.stalks[detected.valid], detected.scores[detected.valid], settings.section)
             return *cut_to_band(chains, scale, band), np.asarray(detected.pooled)
         moved = detected.stalks[detected.valid] - np.array([0, added, 0, added, 0, 0], np.float32)
-        return in_image(moved, scale), detected.scores[detected.valid], np.asarray(detected.pooled)
+        return to_image_coordinates(moved, scale), detected.scores[detected.valid], np.asarray(detected.pooled)
 
     def _find(self, image: np.ndarray, pixels_per_metre: float | None, frame: Frame, band: Band | None) -> Detections:
-        """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame."""
+        """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame, in its coordinates.
+
+        ``band`` has the rows of the band in the whole image.
+        """
         settings = self._settings
         relative_scale = settings.width / settings.full_width / settings.scale_for(image.shape[1], pixels_per_metre)
-        stalks, scores, pooled = self.look(image, pixels_per_metre, None if band is None else _in_frame(band, frame))
+        stalks, scores, pooled = self.detect_boxes(image, pixels_per_metre, None if band is None else _in_frame(band, frame))
         doubt = None if self.gate is None else self.gate.doubt(pooled, scores)
         selected = scores >= self._min_score
         stalks, scores = stalks[selected], scores[selected]
         inside = np.array([_is_inside_frame(stalk, frame) for stalk in stalks], bool)
         stalks, scores = stalks[inside], scores[inside]
         on_device = jnp.asarray(image)
-        pieces = self._pieces(on_device, stalks, settings.crop_height, relative_scale)
+        pieces = self._placed_masks(on_device, stalks, settings.crop_height, relative_scale)
         pieces = [(_clear_border_rows(mask, corner, frame), corner) for mask, corner in pieces]
         once = np.flatnonzero(suppress_duplicates(pieces, scores))
         stalks, scores, pieces = stalks[once], scores[once], [pieces[place] for place in once]
-        strips = [strip_width(mask) if mask.size else None for mask, _ in pieces]
+        strips = [fit_strip(mask) if mask.size else None for mask, _ in pieces]
         higher = [_extrapolate_upward(stalk, strip, corner) for stalk, strip, (_, corner) in zip(stalks, strips, pieces)]
         shown = [place for place, upper in enumerate(higher) if upper is not None]
         some = np.array([higher[place] for place in shown], np.float32).reshape(-1, 6)
-        above = self._pieces(on_device, some, settings.crop_height // 2, relative_scale)
+        above = self._placed_masks(on_device, some, settings.crop_height // 2, relative_scale)
         upper = {place: (_clear_border_rows(mask, corner, frame), corner) for place, (mask, corner) in zip(shown, above)}
         detections = Detections(doubt=doubt)
         for place, (stalk, score, (mask, corner)) in enumerate(zip(stalks, scores, pieces)):
@@ -248,12 +252,12 @@ class Finder:
                 detections.append(Detection(box, axis, float(score), mask, corner, upper.get(place), strips[place]))
         return detections
 
-    def _pieces(
+    def _placed_masks(
         self, image: jax.Array, stalks: np.ndarray, lines: int, relative_scale: float
     ) -> list[tuple[np.ndarray, tuple[int, int]]]:
         """Segment stalks [N, 6] in crops of ``lines`` rows at full resolution; return masks and their corners in the image."""
         crops = self._segment(image, stalks, lines, relative_scale)
-        return [paste(crop, stalk, (image.shape[0], image.shape[1])) for crop, stalk in zip(crops, stalks)]
+        return [paste_crop(crop, stalk, (image.shape[0], image.shape[1])) for crop, stalk in zip(crops, stalks)]
 
     def _segment(self, on_device: jax.Array, stalks: np.ndarray, lines: int, relative_scale: float) -> np.ndarray:
         """Compute masks [N, h, w] float32 of the crops of stalks [N, 6]; ``relative_scale``: see `crop_shape`."""
@@ -266,7 +270,7 @@ class Finder:
         for start in range(0, len(stalks), self._batch):
             part = stalks[start : start + self._batch]
             filled = np.pad(part, ((0, self._batch - len(part)), (0, 0)), mode="edge")
-            crops = cut(on_device, filled, shape)
+            crops = cut_crops(on_device, filled, shape)
             masks.append(segment(self._params["segmenter"], crops, settings, self.dtype, full))
         return np.concatenate(jax.device_get(masks))[: len(stalks)]
 
@@ -291,7 +295,7 @@ def cut_to_band(chains: list[Chain], scale: tuple[float, float], band: Band | No
         if rows[1] - rows[0] > 1.0 and covered(chain, *rows) >= _COVERED:
             stalks.append(cut_chain(chain, *rows))
             scores.append(chain.score)
-    return in_image(np.array(stalks, np.float32).reshape(-1, 6), scale), np.array(scores, np.float32)
+    return to_image_coordinates(np.array(stalks, np.float32).reshape(-1, 6), scale), np.array(scores, np.float32)
 
 
 def _in_frame(band: Band, frame: Frame) -> Band:
@@ -306,13 +310,13 @@ def _in_frame(band: Band, frame: Frame) -> Band:
 
 
 def _is_inside_frame(stalk: np.ndarray, frame: Frame) -> bool:
-    """Return whether more than half of the axis of a stalk [6] lies outside the black borders."""
+    """Return True if, of the axis of a stalk [6] within the image, more than half lies outside the black borders."""
     if frame.shown is None:
         return True
     shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]
     line, column = (np.linspace(begin, end, 21).astype(int) for begin, end in (stalk[1:4:2], stalk[4:]))
     there = (line >= 0) & (line < shown.shape[0]) & (column >= 0) & (column < shown.shape[1])
-    return bool(np.mean(shown[line[there], column[there]]) > _SHOWN) if there.any() else False
+    return bool(np.mean(shown[line[there], column[there]]) > _MIN_VISIBLE) if there.any() else False
 
 
 def _clear_border_rows(mask: np.ndarray, corner: tuple[int, int], frame: Frame) -> np.ndarray:
@@ -326,7 +330,7 @@ def _clear_border_rows(mask: np.ndarray, corner: tuple[int, int], frame: Frame) 
     return visible
 
 
-def _in_whole_image(detection: Detection, frame: Frame) -> Detection:
+def _to_full_image(detection: Detection, frame: Frame) -> Detection:
     """Convert a detection from the coordinates of a frame to those of the whole image."""
     down, over = frame.lines[0], frame.columns[0]
     if not down and not over:

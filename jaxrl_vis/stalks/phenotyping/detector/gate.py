@@ -19,7 +19,7 @@ from jaxrl_vis.stalks.digests import file_digest
 MEASURES = 3
 """Number of measures of an image."""
 _COMMAND = "python -m benchmarks.stalks.gate"
-_PARTS = 5
+_FOLDS = 5
 _UNSURE = 0.1  # lower scores are those of background
 
 
@@ -29,7 +29,7 @@ class Gate:
 
     Attributes:
         mean: [D] float32, mean of the pooled features; D is twice the number of backbone channels.
-        scale: [D] float32, standard deviation of each feature.
+        scale: [D] float32, standard deviation of each feature, regularised.
         axes: [D, K] float32, principal axes of the standardised features, divided by the standard deviation along each.
         beside: Root mean square of the residual outside the principal subspace.
         weights: [1 + MEASURES] float32, intercept and weights of the regression.
@@ -47,7 +47,7 @@ class Gate:
         """Compute the measures [MEASURES] of an image: log distance, log residual, and uncertain fraction of the scores.
 
         Args:
-            pooled: [D] float32, see `detect.Found`.
+            pooled: [D] float32, see `detect.DetectorOutput`.
             scores: [N] of all detections, including those with low scores.
         """
         offset = (np.asarray(pooled, np.float64) - self.mean) / self.scale
@@ -118,7 +118,7 @@ def read_gate(weights: Path) -> Gate | None:
 
 
 def fit_gate(
-    pooled: np.ndarray, scores: list[np.ndarray], wrong: np.ndarray, plots: np.ndarray, axes: int, max_flagged: float
+    pooled: np.ndarray, scores: list[np.ndarray], misread: np.ndarray, plots: np.ndarray, axes: int, max_flagged: float
 ) -> Gate:
     """Fit a gate.
 
@@ -128,7 +128,7 @@ def fit_gate(
     Args:
         pooled: Pooled features [N, D] of synthetic images.
         scores: Scores of the detections in each image.
-        wrong: [N] bool, True for images that were misread.
+        misread: [N] bool, True for images that were misread.
         plots: [N] int, plot of each image.
         axes: Number of principal axes.
         max_flagged: Fraction of the correctly read images above the threshold (false positive rate).
@@ -136,45 +136,49 @@ def fit_gate(
     Raises:
         ValueError: There are too few correctly read images, or no misread ones.
     """
-    if (~wrong).sum() < 3 * axes or not wrong.any():
+    if (~misread).sum() < 3 * axes or not misread.any():
         raise ValueError(f"a gate needs {3 * axes} images that are read rightly, and one that is not")
-    parts = np.unique(plots, return_inverse=True)[1] % _PARTS
-    measures = np.zeros((len(wrong), MEASURES))
-    for part in range(_PARTS):
+    parts = np.unique(plots, return_inverse=True)[1] % _FOLDS
+    measures = np.zeros((len(misread), MEASURES))
+    for part in range(_FOLDS):
         here = np.flatnonzero(parts == part)
-        of_others = _statistics(pooled[~wrong & (parts != part)], axes)
+        of_others = _fit_statistics(pooled[~misread & (parts != part)], axes)
         measures[here] = [of_others.measures(pooled[place], scores[place]) for place in here]
-    weights = logistic(measures, wrong)
+    weights = fit_logistic_regression(measures, misread)
     doubts = 1.0 / (1.0 + np.exp(-np.clip(weights[0] + measures @ weights[1:], -30.0, 30.0)))
-    threshold = float(np.quantile(doubts[~wrong], 1.0 - max_flagged))
-    return dataclasses.replace(_statistics(pooled[~wrong], axes), weights=weights, threshold=threshold)
+    threshold = float(np.quantile(doubts[~misread], 1.0 - max_flagged))
+    return dataclasses.replace(_fit_statistics(pooled[~misread], axes), weights=weights, threshold=threshold)
 
 
-def _statistics(right: np.ndarray, axes: int) -> Gate:
+def _fit_statistics(pooled: np.ndarray, axes: int) -> Gate:
     """Return a gate with the statistics of pooled features [N, D] of correctly read images, and zero weights."""
-    mean, scale = right.mean(axis=0), right.std(axis=0)
+    mean, scale = pooled.mean(axis=0), pooled.std(axis=0)
     scale = scale + 0.1 * scale.mean() + 1e-6  # regularised: few images may understate the variance
-    offset = (right - mean) / scale
+    offset = (pooled - mean) / scale
     _, lengths, directions = np.linalg.svd(offset, full_matrices=False)
-    spread = lengths[:axes] / np.sqrt(len(right))
+    spread = lengths[:axes] / np.sqrt(len(pooled))
     principal = (directions[:axes] / spread[:, None]).T
     left = offset - (offset @ directions[:axes].T) @ directions[:axes]
     return Gate(mean, scale, principal, float(np.sqrt(np.mean(left**2))), np.zeros(1 + MEASURES), 0.5)
 
 
-def logistic(measures: np.ndarray, wrong: np.ndarray) -> np.ndarray:
-    """Fit a class-balanced, L2-regularised logistic regression to measures [N, M] by Newton's method.
+def fit_logistic_regression(measures: np.ndarray, misread: np.ndarray) -> np.ndarray:
+    """Fit a class-balanced, L2-regularised logistic regression by Newton's method.
+
+    Args:
+        measures: [N, M] float64, inputs.
+        misread: [N] bool, targets, with both values.
 
     Returns:
         Intercept and weights [1 + M].
     """
     inputs = np.concatenate([np.ones((len(measures), 1)), measures], axis=1)
-    weight = np.where(wrong, 0.5 / wrong.sum(), 0.5 / (~wrong).sum())
+    weight = np.where(misread, 0.5 / misread.sum(), 0.5 / (~misread).sum())
     shrink = np.diag([0.0, *[1e-3] * measures.shape[1]])
     weights = np.zeros(inputs.shape[1])
     for _ in range(50):
-        chance = 1.0 / (1.0 + np.exp(-np.clip(inputs @ weights, -30.0, 30.0)))
-        slope = inputs.T @ (weight * (chance - wrong)) + shrink @ weights
-        bend = (inputs.T * (weight * chance * (1.0 - chance))) @ inputs + shrink + 1e-9 * np.eye(len(weights))
-        weights = weights - np.linalg.solve(bend, slope)
+        probability = 1.0 / (1.0 + np.exp(-np.clip(inputs @ weights, -30.0, 30.0)))
+        gradient = inputs.T @ (weight * (probability - misread)) + shrink @ weights
+        hessian = (inputs.T * (weight * probability * (1.0 - probability))) @ inputs + shrink + 1e-9 * np.eye(len(weights))
+        weights = weights - np.linalg.solve(hessian, gradient)
     return weights

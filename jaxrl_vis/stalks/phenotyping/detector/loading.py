@@ -75,5 +75,11 @@ def find_stalks(
         pixels_per_metre: Resolution of the image at the row; None if the camera is unknown.
         band: Rows of the band; None if the camera is unknown.
         plot, pair: Folder and files of the image; unused.
+
+    Returns:
+        The detections, a `Detections`, sorted from left to right.
+
+    Raises:
+        RequestError: The weights cannot be read.
     """
     return _cached_finder(weights, min_score)(image, pixels_per_metre, band)

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import optax
 
 from jaxrl_vis.stalks.phenotyping.detector.anchors import encode, make_anchors
-from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals, heads, normalise, region_features
+from jaxrl_vis.stalks.phenotyping.detector.boxes import box_iou, strip_overlap
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, apply_heads, normalise, pool_regions, select_proposals
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import preprocess_crops
 
 
-def assign(
+def assign_boxes(
     overlaps: jax.Array, kinds: jax.Array, positive: float, negative: float, best_of_stalk: jax.Array | None = None
 ) -> tuple[jax.Array, ...]:
     """Assign boxes to true stalks.
@@ -50,7 +50,7 @@ def detector_loss(
         params: Parameters of the detector.
         images: [N, H, W, 3] uint8, resized and padded.
         truth: True stalks [N, T, 6].
-        kinds: [N, T] int32, see `assign`.
+        kinds: [N, T] int32, see `assign_boxes`.
         settings: Settings of the networks.
         dtype: Compute dtype of the convolutions.
         key: PRNG key of the jittered true boxes that the head is trained on besides the proposals.
@@ -63,49 +63,49 @@ def detector_loss(
     anchors = jnp.asarray(make_anchors(shape, settings.band_height, settings.anchor_widths))
     features = network.apply(params, normalise(images), method="features")
     assert isinstance(features, jax.Array)
-    logits, codes = heads(network, params, features, "propose")
+    logits, codes = apply_heads(network, params, features, "propose")
 
-    def of_image(features, logits, codes, truth, kinds, key):
-        which, shows, none = assign(overlap(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
-        loss = focal(logits, shows, none) / jnp.maximum(shows.sum(), 1)
-        placed = distance(codes, encode(truth[which], anchors), shows)
+    def image_loss(features, logits, codes, truth, kinds, key):
+        which, shows, none = assign_boxes(box_iou(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
+        loss = focal_loss(logits, shows, none) / jnp.maximum(shows.sum(), 1)
+        placed = offset_loss(codes, encode(truth[which], anchors), shows)
 
-        proposals, _, valid = best_proposals(*jax.lax.stop_gradient((logits, codes)), anchors, settings, shape)
+        proposals, _, valid = select_proposals(*jax.lax.stop_gradient((logits, codes)), anchors, settings, shape)
         size = jnp.concatenate([truth[:, 2:4] - truth[:, :2]] * 2 + [truth[:, 2:3] - truth[:, :1]] * 2, axis=-1)
         near = truth + 0.15 * jax.random.normal(key, truth.shape) * size
         proposals = jnp.concatenate([proposals, near])
         valid = jnp.concatenate([valid, kinds == STALK])
         # In a clump, a box between two stalks overlaps both by half, but its strip overlaps neither.
-        alike = 0.5 * (overlap(proposals[:, :4], truth[:, :4]) + band_overlap(proposals, truth))
-        which, shows, none = assign(alike, kinds, 0.5, 0.45)
+        alike = 0.5 * (box_iou(proposals[:, :4], truth[:, :4]) + strip_overlap(proposals, truth))
+        which, shows, none = assign_boxes(alike, kinds, 0.5, 0.45)
         shows, none = shows & valid, none & valid
-        judged, refined = heads(network, params, region_features(features, proposals), "classify")
+        judged, refined = apply_heads(network, params, pool_regions(features, proposals), "classify")
         weight = (shows | none).astype(jnp.float32)
         right = optax.sigmoid_binary_cross_entropy(judged, shows.astype(jnp.float32))
         judgement = (right * weight).sum() / jnp.maximum(weight.sum(), 1.0)
-        refinement = distance(refined, encode(truth[which], proposals), shows)
+        refinement = offset_loss(refined, encode(truth[which], proposals), shows)
         return loss, placed, 2.0 * judgement, 2.0 * refinement
 
     keys = jax.random.split(key, images.shape[0])
-    parts = jax.vmap(of_image)(features, logits, codes, truth, kinds, keys)
+    parts = jax.vmap(image_loss)(features, logits, codes, truth, kinds, keys)
     named = {name: part.mean() for name, part in zip(("objectness", "offsets", "head", "boxes"), parts)}
     return sum(named.values(), jnp.zeros(())), named
 
 
-def focal(logits: jax.Array, shows: jax.Array, none: jax.Array) -> jax.Array:
-    """Sum the focal loss over the positive and negative anchors."""
+def focal_loss(logits: jax.Array, shows: jax.Array, none: jax.Array) -> jax.Array:
+    """Sum the focal loss of logits [K] over the positive and negative anchors, each [K] bool."""
     loss = optax.sigmoid_focal_loss(logits, shows.astype(jnp.float32), alpha=0.5, gamma=2.0)
     return (loss * (shows | none)).sum()
 
 
-def distance(codes: jax.Array, targets: jax.Array, shows: jax.Array) -> jax.Array:
-    """Compute the Huber loss of box offsets [K, 6], averaged over the positive boxes."""
-    loss = optax.huber_loss(codes, jnp.clip(targets, -20.0, 20.0), delta=1.0).sum(axis=-1)
+def offset_loss(offsets: jax.Array, targets: jax.Array, shows: jax.Array) -> jax.Array:
+    """Compute the Huber loss of box offsets [K, 6], summed over the six and averaged over the positive boxes [K] bool."""
+    loss = optax.huber_loss(offsets, jnp.clip(targets, -20.0, 20.0), delta=1.0).sum(axis=-1)
     return (loss * shows).sum() / jnp.maximum(shows.sum(), 1)
 
 
 def segmenter_loss(params: Any, crops: jax.Array, masks: jax.Array, settings: Settings, dtype: Any) -> jax.Array:
-    """Compute the cross-entropy and Dice loss of the segmentation of stalk crops.
+    """Compute the scalar cross-entropy and Dice loss of the segmentation of stalk crops, see `mask_loss`.
 
     Args:
         params: Parameters of the segmentation network.

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import optax
 
 from jaxrl_vis.stalks.phenotyping.detector.anchors import encode
-from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, heads, normalise, region_features, section_proposals
-from jaxrl_vis.stalks.phenotyping.detector.losses import assign, distance, focal
+from jaxrl_vis.stalks.phenotyping.detector.boxes import box_iou, strip_overlap
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, apply_heads, normalise, pool_regions, section_proposals
+from jaxrl_vis.stalks.phenotyping.detector.losses import assign_boxes, focal_loss, offset_loss
 from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, section_anchors, true_sections
 
 _NEAR = 64  # jittered true sections per image that the head is trained on
@@ -32,7 +32,7 @@ def section_loss(
         params: Parameters of the detector.
         images: [N, H, W, 3] uint8, resized and padded.
         edges: Edges of the true stalks [N, T, R, 3], see `sections`.
-        kinds: [N, T] int32, see `losses.assign`.
+        kinds: [N, T] int32, see `losses.assign_boxes`.
         sizes: [N, 2] int32, height and width of the images without padding.
         settings: Settings of the networks.
         dtype: Compute dtype of the convolutions.
@@ -45,19 +45,19 @@ def section_loss(
     anchors = jnp.asarray(section_anchors((images.shape[1], images.shape[2]), settings.section, settings.anchor_widths))
     features = network.apply(params, normalise(images), method="features")
     assert isinstance(features, jax.Array)
-    logits, codes = heads(network, params, features, "propose")
+    logits, codes = apply_heads(network, params, features, "propose")
 
-    def of_image(features, logits, codes, edges, kinds, size, key):
+    def image_loss(features, logits, codes, edges, kinds, size, key):
         truth, kinds = true_sections(edges, kinds, size, settings.section)
 
         def assign_anchors(anchors, truth, kinds):
-            which, shows, none = assign(overlap(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
+            which, shows, none = assign_boxes(box_iou(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
             return truth[which], shows, none
 
         wanted, shows, none = jax.vmap(assign_anchors)(anchors, truth, kinds)
         shows, none = shows.reshape(-1), none.reshape(-1)
-        loss = focal(logits, shows, none) / jnp.maximum(shows.sum(), 1)
-        placed = distance(codes, encode(wanted, anchors).reshape(-1, 6), shows)
+        loss = focal_loss(logits, shows, none) / jnp.maximum(shows.sum(), 1)
+        placed = offset_loss(codes, encode(wanted, anchors).reshape(-1, 6), shows)
 
         proposals, bands, valid = section_proposals(*jax.lax.stop_gradient((logits, codes)), anchors, settings)
         near, near_bands, near_valid = _jittered(truth, kinds, key)
@@ -65,21 +65,21 @@ def section_loss(
         valid = jnp.concatenate([valid, near_valid])
 
         def similarity(proposal, truth):
-            return 0.5 * (overlap(proposal[None, :4], truth[:, :4]) + band_overlap(proposal[None], truth, 4))[0]
+            return 0.5 * (box_iou(proposal[None, :4], truth[:, :4]) + strip_overlap(proposal[None], truth, 4))[0]
 
         alike = jax.vmap(similarity)(proposals, truth[bands])
         best = jnp.zeros(kinds.shape).at[bands].max(jnp.where(kinds[bands] == STALK, alike, 0.0))
-        which, shows, none = assign(alike, kinds[bands], 0.5, 0.45, best[bands])
+        which, shows, none = assign_boxes(alike, kinds[bands], 0.5, 0.45, best[bands])
         shows, none = shows & valid, none & valid
-        judged, refined = heads(network, params, region_features(features, proposals, settings.section), "classify")
+        judged, refined = apply_heads(network, params, pool_regions(features, proposals, settings.section), "classify")
         weight = (shows | none).astype(jnp.float32)
         right = optax.sigmoid_binary_cross_entropy(judged, shows.astype(jnp.float32))
         judgement = (right * weight).sum() / jnp.maximum(weight.sum(), 1.0)
-        refinement = distance(refined, encode(truth[bands, which], proposals), shows)
+        refinement = offset_loss(refined, encode(truth[bands, which], proposals), shows)
         return loss, placed, 2.0 * judgement, 2.0 * refinement
 
     keys = jax.random.split(key, images.shape[0])
-    parts = jax.vmap(of_image)(features, logits, codes, edges, kinds, sizes, keys)
+    parts = jax.vmap(image_loss)(features, logits, codes, edges, kinds, sizes, keys)
     named = {name: part.mean() for name, part in zip(("objectness", "offsets", "head", "boxes"), parts)}
     return sum(named.values(), jnp.zeros(())), named
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-_ALONG = 15  # rows of a full-size stalk crop that are averaged
+_AVERAGED_ROWS = 15  # rows of a full-size stalk crop that are averaged
 _EXPONENT = 0.35
 
 
@@ -26,7 +26,7 @@ def crop_shape(full_shape: tuple[int, int], scale: float) -> tuple[int, int]:
     return lines, columns
 
 
-def crop_places(stalks: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def crop_positions(stalks: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the positions of stalk crops in the image, computed on the host for both cutting out and pasting back.
 
     Args:
@@ -47,15 +47,15 @@ def crop_places(stalks: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray,
     return top, np.round(axis - 0.5 * shape[1]).astype(np.int32)
 
 
-def cut(image: jax.Array, stalks: np.ndarray, shape: tuple[int, int]) -> jax.Array:
+def cut_crops(image: jax.Array, stalks: np.ndarray, shape: tuple[int, int]) -> jax.Array:
     """Cut stalk crops [N, height, width, ...] out of an image [H, W, ...]; 0 outside the image.
 
     Args:
-        image: Image of any dtype.
-        stalks: [N, 6]; see `crop_places`.
+        image: Image of any dtype, which is that of the crops.
+        stalks: [N, 6]; see `crop_positions`.
         shape: Height and width of a crop.
     """
-    return _cut(image, *crop_places(stalks, shape), shape[1])
+    return _cut(image, *crop_positions(stalks, shape), shape[1])
 
 
 @functools.partial(jax.jit, static_argnums=3)
@@ -76,25 +76,25 @@ def preprocess_crops(crops: jax.Array) -> jax.Array:
     Args:
         crops: Stalk crops, uint8 or float from 0 to 255.
     """
-    margin = _ALONG // 2
+    margin = _AVERAGED_ROWS // 2
     values = jnp.pad(crops.astype(jnp.float32) / 255.0, ((0, 0), (margin, margin), (0, 0), (0, 0)), mode="edge")
-    sums = jax.lax.reduce_window(values, 0.0, jax.lax.add, (1, _ALONG, 1, 1), (1, 1, 1, 1), "VALID")
-    return 2.0 * jnp.maximum(sums / _ALONG, 0.0) ** _EXPONENT - 1.0
+    sums = jax.lax.reduce_window(values, 0.0, jax.lax.add, (1, _AVERAGED_ROWS, 1, 1), (1, 1, 1, 1), "VALID")
+    return 2.0 * jnp.maximum(sums / _AVERAGED_ROWS, 0.0) ** _EXPONENT - 1.0
 
 
-def paste(crop: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
+def paste_crop(crop: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
     """Paste a stalk crop back to its position in the image.
 
     Args:
         crop: Values [height, width] float32 of the crop, such as a mask.
-        stalk: [6], stalk that the crop was cut along; see `crop_places`.
+        stalk: [6], stalk that the crop was cut along; see `crop_positions`.
         size: Height and width of the image.
 
     Returns:
         Part of the image [h, w] float32, 0 outside the crop, and the image row and column of its first pixel; empty if the crop
         lies outside the image.
     """
-    top, left = (edge[0] for edge in crop_places(stalk[None], (crop.shape[0], crop.shape[1])))
+    top, left = (edge[0] for edge in crop_positions(stalk[None], (crop.shape[0], crop.shape[1])))
     columns = crop.shape[1]
     used = np.flatnonzero((top + np.arange(crop.shape[0]) >= 0) & (top + np.arange(crop.shape[0]) < size[0]))
     begin, end = max(int(left.min()), 0), min(int(left.max()) + columns, size[1])

@@ -33,7 +33,7 @@ _KEYS = {
 """Keys in files of the `Settings` fields that have another name there."""
 _FIELDS = {key: name for name, key in _KEYS.items()}
 # Minimum, maximum and divisor of each setting: a file must not request a network that does not fit in memory.
-_SANE: dict[str, tuple[float, float, int]] = {
+_LIMITS: dict[str, tuple[float, float, int]] = {
     "pixels_per_metre": (0, 100_000, 1),
     **dict.fromkeys(("width", "full_width"), (32, 16384, 1)),
     **dict.fromkeys(("crop_height", "crop_width"), (16, 2048, 8)),
@@ -72,7 +72,8 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
         Parameters, settings, and the metadata on their origin.
 
     Raises:
-        RequestError: The file does not exist, is not a weights file, or its parameters do not match its settings.
+        RequestError: The file does not exist, is not a weights file of this version, or its parameters do not match its
+            settings.
     """
 
     def declare(about: dict[str, Any]) -> tuple[Settings, Any]:
@@ -82,20 +83,20 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
         values = {_FIELDS.get(str(key), str(key)): value for key, value in values.items()}
         if about.pop("schema") != SCHEMA or not values.keys() <= _HINTS.keys():
             raise RequestError(f"{path} holds weights of another version: train them again with `{_COMMAND}`")
-        settings = _checked(path, values)
+        settings = _check_settings(path, values)
         return settings, declare_shapes(settings)
 
     return read_parameters(path, _COMMAND, declare)
 
 
-def _checked(path: Path, values: dict[str, Any]) -> Settings:
+def _check_settings(path: Path, values: dict[str, Any]) -> Settings:
     """Return the settings with these ``values``, after checking their types and ranges.
 
     Raises:
         RequestError: A type or range is invalid.
     """
     settings = Settings(**{name: fields.check(f"{path}: {name}", _HINTS[name], value) for name, value in values.items()})
-    for name, (low, high, step) in _SANE.items():
+    for name, (low, high, step) in _LIMITS.items():
         value = getattr(settings, name)
         check_range(path, name, value if isinstance(value, tuple) else (value,), low, high, step)
     if len(settings.channels) != len(Settings.channels):

@@ -21,7 +21,7 @@ import jaxrl_vis_envs.plants
 from jaxrl_vis.host.provenance import device_name, revision
 from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all
 from jaxrl_vis.stalks.digests import file_digest, value_digest
-from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, ThesisScore, score_plot, summary
+from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, ThesisScore, score_plot, summarise_scores
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis_envs.plants import Family
 
@@ -59,6 +59,9 @@ def evaluate_plot(task: Task, seed: int) -> Record:
     Args:
         task: Settings of the evaluation.
         seed: Seed of the plot.
+
+    Raises:
+        RequestError: The weights cannot be read.
     """
     find = None
     if task.weights is not None:
@@ -67,7 +70,7 @@ def evaluate_plot(task: Task, seed: int) -> Record:
         find = load_finder(task.weights, MIN_RECORDED_SCORE)
     score = score_plot(task.family, seed, find, task.method, task.min_score, task.thesis)
     where = {"device": device_name(), "workers": task.workers, "revision": revision()}
-    return {**where, **_record(score, task.family.rig.frames)}
+    return {**where, **_make_record(score, task.family.rig.frames)}
 
 
 def conditions(task: Task) -> dict[str, Any]:
@@ -109,7 +112,7 @@ def evaluate_tasks(
         done: Called after each plot with the task's name, the seed and the record.
 
     Returns:
-        Name -> summary of all plots, see `scoring.summary`.
+        Name -> summary of all plots, see `scoring.summarise_scores`.
 
     Raises:
         RequestError: A file holds records of another evaluation, or cannot be read.
@@ -137,16 +140,16 @@ def _evaluate_job(tasks: Mapping[str, Task], jobs: Sequence[tuple[str, int]], nu
 
 
 def read_scores(records: Iterable[Record]) -> list[PlotScore]:
-    """Convert records to scores."""
-    return [_read(record) for record in records]
+    """Convert records to scores, in the same order."""
+    return [_read_score(record) for record in records]
 
 
 def summarise(min_score: float, records: Iterable[Record]) -> dict[str, Any]:
-    """Summarise the records of plots, see `summary`."""
-    return summary(read_scores(records), min_score)
+    """Summarise the records of plots, see `summarise_scores`."""
+    return summarise_scores(read_scores(records), min_score)
 
 
-def _record(score: PlotScore, pairs: int) -> Record:
+def _make_record(score: PlotScore, pairs: int) -> Record:
     """Convert a plot's score to a record of JSON types."""
     thesis = score.thesis
     return {
@@ -165,8 +168,8 @@ def _record(score: PlotScore, pairs: int) -> Record:
     }
 
 
-def _read(record: Record) -> PlotScore:
-    """Convert a record to a score, the inverse of `_record`."""
+def _read_score(record: Record) -> PlotScore:
+    """Convert a record to a score, the inverse of `_make_record`."""
 
     def pairs(values: list[list[float]]) -> np.ndarray:
         return np.array(values, float).reshape(-1, 2)

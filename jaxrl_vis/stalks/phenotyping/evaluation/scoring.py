@@ -17,9 +17,9 @@ from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection
 from jaxrl_vis.stalks.phenotyping.evaluation.perfect import perfect_detections
 from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean_widths, measure_pair_as_thesis
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
-from jaxrl_vis.stalks.phenotyping.track.follow import follow
+from jaxrl_vis.stalks.phenotyping.track.follow import track_stalks
 from jaxrl_vis.stalks.phenotyping.track.heights import stalk_widths
-from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Find, Sighting, find_with_ground, measure_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Find, Sighting, detect_with_ground, measure_pair
 from jaxrl_vis_envs.plants import Family, Stalk, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import HEIGHTS, StalkInView, stalks_in_view
@@ -105,18 +105,18 @@ def score_plot(
         stalks = stalks_in_view(plot, pair.pose, drive.true, instance, np.asarray(pair.depth))
         started = time.monotonic()
         finder = find or functools.partial(_true_detections, stalks, instance)
-        detections, ground = find_with_ground(finder, left, right, drive.stated, distance=distance)
+        detections, ground = detect_with_ground(finder, left, right, drive.stated, distance=distance)
         selected = [place for place, detection in enumerate(detections) if detection.score >= min_score]
         finds_kept = [detections[place] for place in selected]
         frames.append(measure_pair(finds_kept, left, right, drive.stated, method, ground))
         seconds.append(time.monotonic() - started)
         if with_thesis:
             as_thesis.append(measure_pair_as_thesis(finds_kept, left, right, drive.stated))
-        matched, scored = match(detections, stalks)
+        matched, scored = match_detections(detections, stalks)
         total += sum(stalk.band_box is not None and stalk.band_visible >= MIN_VISIBLE for stalk in stalks)
         finds += scored
         owners.append([matched[place] for place in selected])
-    tracks, _ = follow(frames, drive.odometry, drive.stated)
+    tracks, _ = track_stalks(frames, drive.odometry, drive.stated)
     widths, upper, errors = [], [], []
     counted = [track for track in tracks if track.counted]
     for track, measured in zip(counted, stalk_widths(frames, counted)):
@@ -159,12 +159,17 @@ def _thesis_score(frames: list[list[Sighting]], owners: list[list[int | None]], 
 
 
 def true_diameter(stalk: Stalk, height: float = HEIGHTS[0]) -> float:
-    """Return the true diameter in mm, as the cameras face it, at a height in m; near a node, the mean above and below it."""
+    """Return the true diameter in mm, as the cameras face it, at a height in m.
+
+    Less than 1 cm from a node, return the mean 2 cm above and below.
+    """
     offsets = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
     return 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in offsets]))
 
 
-def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[int | None], list[tuple[float, float]]]:
+def match_detections(
+    detections: list[Detection], stalks: list[StalkInView]
+) -> tuple[list[int | None], list[tuple[float, float]]]:
     """Match detections with stalks as COCO does: greedily by descending score, each stalk once, at an IoU of at least 0.5.
 
     Args:
@@ -182,7 +187,7 @@ def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[
     scored: list[tuple[float, float]] = []
     free = np.ones(len(there), bool)
     for place in sorted(range(len(detections)), key=lambda number: -detections[number].score):
-        overlaps = overlaps_with(np.array(detections[place].box), boxes)
+        overlaps = iou_with_boxes(np.array(detections[place].box), boxes)
         fitting = free & (overlaps >= IOU)
         of_clear = np.where(fitting & clear, overlaps, 0.0)
         best = int(np.argmax(of_clear)) if of_clear.any() else None
@@ -195,7 +200,7 @@ def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[
     return owners, scored
 
 
-def overlaps_with(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+def iou_with_boxes(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Compute the intersection over union [N] of a box [4] with boxes [N, 4] (left, top, right, bottom)."""
     low, high = np.maximum(box[:2], boxes[:, :2]), np.minimum(box[2:], boxes[:, 2:])
     common = np.prod(np.clip(high - low, 0.0, None), axis=1)
@@ -205,6 +210,8 @@ def overlaps_with(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
 
 def average_precision(finds: np.ndarray, stalks: int) -> float:
     """Compute COCO's average precision: the mean over 101 recall levels of the maximum precision at that recall or higher.
+
+    It is 0 without detections or stalks.
 
     Args:
         finds: Score of each detection, and 1 if it is correct, else 0, [K, 2].
@@ -220,7 +227,7 @@ def average_precision(finds: np.ndarray, stalks: int) -> float:
     return float(np.where(place < len(precision), precision[np.minimum(place, len(precision) - 1)], 0.0).mean())
 
 
-def summary(scores: Iterable[PlotScore], min_score: float = 0.5) -> dict[str, Any]:
+def summarise_scores(scores: Iterable[PlotScore], min_score: float = 0.5) -> dict[str, Any]:
     """Summarise the scores of plots.
 
     Args:
@@ -303,7 +310,7 @@ def _thesis_summary(scores: list[PlotScore]) -> dict[str, float]:
 
 
 def _agreement(counted: np.ndarray, true: np.ndarray) -> float:
-    """Compute 1 - SSE / SST against y = x; NaN if all true values are equal."""
+    """Compute the coefficient of determination 1 - SSE / SST of counts against y = x; NaN if all true counts are equal."""
     spread = float(((true - true.mean()) ** 2).sum()) if len(true) else 0.0
     return 1.0 - float(((counted - true) ** 2).sum()) / spread if spread > 0 else float("nan")
 

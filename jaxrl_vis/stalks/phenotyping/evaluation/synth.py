@@ -25,7 +25,7 @@ import jaxrl_vis
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.spreadsheets import to_csv
-from jaxrl_vis.stalks.phenotyping.io.annotations import coco
+from jaxrl_vis.stalks.phenotyping.io.annotations import make_coco
 from jaxrl_vis.stalks.phenotyping.io.calibration import write_calibration
 from jaxrl_vis.stalks.phenotyping.io.images import SUFFIX, ImageFormat, write_image
 from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask
@@ -56,7 +56,8 @@ def write_plots(
         seeds: Seeds, one per plot.
         image_format: Format of the camera images.
         truth: ``all``; ``boxes``, without masks and without disparity and instance images; or ``none``, only plot.json.
-        done: Called after each pair with the plot's seed and the number of its pairs written so far.
+        done: Called after each pair with the plot's seed and the number of its pairs written so far, and once for a plot that
+            exists.
 
     Returns:
         The number of plots that already existed.
@@ -88,7 +89,7 @@ def write_plots(
 
 
 def _is_complete(folder: Path, truth: Truth, frames: int) -> bool:
-    """Return whether a complete plot holds at least the requested ground truth."""
+    """Return True if a plot that was written completely holds at least the requested ground truth."""
     maps = [folder / "truth" / f"{kind}_{frame:03d}.png" for kind in ("instance", "disparity") for frame in range(frames)]
     wanted = {"none": [], "boxes": [folder / "annotations.json"], "all": [folder / "annotations.json", *maps]}[truth]
     return all(path.exists() for path in wanted)
@@ -121,10 +122,10 @@ def write_plot(folder: Path, plot: Plot, image_format: ImageFormat, truth: Truth
             annotations += [_annotation(pair.frame, stalk, instance, truth == "all") for stalk in stalks if stalk.pixels]
             visible += [{"pair": pair.frame, **dataclasses.asdict(stalk)} for stalk in stalks]
         done(plot.seed, pair.frame + 1)
-    write_atomically(folder / "odometry.csv", _odometry(sequence, SUFFIX[image_format]))
+    write_atomically(folder / "odometry.csv", _odometry_csv(sequence, SUFFIX[image_format]))
     if truth != "none":
         text = f"synthetic stalks, family {plot.family.name}, seed {plot.seed}"
-        write_atomically(folder / "annotations.json", json.dumps(coco(images, annotations, {"description": text})) + "\n")
+        write_atomically(folder / "annotations.json", json.dumps(make_coco(images, annotations, {"description": text})) + "\n")
     write_atomically(folder / "plot.json", json.dumps(_summary(sequence, visible)) + "\n")
 
 
@@ -151,7 +152,7 @@ def _annotation(frame: int, stalk: StalkInView, instance: np.ndarray, with_mask:
     return annotation
 
 
-def _odometry(sequence: Sequence, suffix: str) -> str:
+def _odometry_csv(sequence: Sequence, suffix: str) -> str:
     rows = []
     for frame, (time, distance) in enumerate(zip(sequence.drive.times, sequence.drive.odometry)):
         images = {side: f"{side}_{frame:03d}{suffix}" for side in ("left", "right")}

@@ -18,7 +18,11 @@ _DEPTHS = (0.5, 1.3)  # m
 def measure_pair_as_thesis(
     detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration
 ) -> list[Sighting]:
-    """Measure the detections in a pair of images [H, W, 3] uint8 by ellipses and semi-global matching."""
+    """Measure the detections in a rectified pair of images [H, W, 3] uint8 by ellipses and semi-global matching.
+
+    Returns:
+        One sighting for each detection, in the same order.
+    """
     disparity = np.full(left.shape[:2], np.nan, np.float32)
     far, near = (float(calibration.disparity(np.array(depth))) for depth in reversed(_DEPTHS))
     for detection in detections:

@@ -12,9 +12,9 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.annotation_files.gather import gather
-from jaxrl_vis.stalks.phenotyping.io.annotation_files.labels import choose
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.labels import select_stalks
 from jaxrl_vis.stalks.phenotyping.io.images import MAX_PIXELS
-from jaxrl_vis.stalks.phenotyping.io.masks import box_around_runs, covering, decode_counts
+from jaxrl_vis.stalks.phenotyping.io.masks import box_around_runs, check_runs, decode_counts
 from jaxrl_vis.stalks.phenotyping.io.names import readable
 
 STALK = 1
@@ -22,7 +22,7 @@ STALK = 1
 _MAX_COORDINATE = 1e7  # pixels
 
 
-def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about: dict[str, Any]) -> dict[str, Any]:
+def make_coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about: dict[str, Any]) -> dict[str, Any]:
     """Return a COCO data set of stalks.
 
     Args:
@@ -46,7 +46,7 @@ def read_annotations(folder: Path, labels: Sequence[str] = ()) -> dict[str, Any]
 
     Args:
         folder: The folder.
-        labels: Labels that count as stalks, see `labels.choose`; annotations with other labels are left out.
+        labels: Labels that count as stalks, see `labels.select_stalks`; annotations with other labels are left out.
 
     Returns:
         ``images``, each with id, file_name, width and height; ``annotations``, each with an image_id, a bbox [4] (left, top,
@@ -65,10 +65,10 @@ def read_annotations(folder: Path, labels: Sequence[str] = ()) -> dict[str, Any]
         for annotation in image.annotations:
             annotations.append({**annotation, "image_id": annotation["image_id"] if annotation.get("orphan") else key})
     path = folder / "annotations.json" if (folder / "annotations.json").exists() else folder
-    return _checked_annotations({"images": images, "annotations": annotations}, path, labels)
+    return _check_annotations({"images": images, "annotations": annotations}, path, labels)
 
 
-def _checked_annotations(data: dict[str, Any], path: Path, labels: Sequence[str]) -> dict[str, Any]:
+def _check_annotations(data: dict[str, Any], path: Path, labels: Sequence[str]) -> dict[str, Any]:
     """Select and validate the annotations of stalks.
 
     Raises:
@@ -76,8 +76,8 @@ def _checked_annotations(data: dict[str, Any], path: Path, labels: Sequence[str]
     """
     if not data["images"] or not data["annotations"]:
         raise RequestError(f"{path} annotates nothing: name a folder with annotated images")
-    stalks, summary = choose(data["annotations"], labels, str(path))
-    images = [_checked_image(image, index) for index, image in enumerate(data["images"])]
+    stalks, summary = select_stalks(data["annotations"], labels, str(path))
+    images = [_check_image(image, index) for index, image in enumerate(data["images"])]
     twice = len(images) - len({image["id"] for image in images})
     if twice:
         raise RequestError(f"{path}: {twice} images have the id of another one, so nobody can tell whose annotations are whose")
@@ -87,7 +87,7 @@ def _checked_annotations(data: dict[str, Any], path: Path, labels: Sequence[str]
         try:
             if annotation.get("problem"):
                 raise ValueError(annotation["problem"])
-            annotations.append(_checked_annotation(annotation, sizes))
+            annotations.append(_check_annotation(annotation, sizes))
         except ValueError as error:
             raise RequestError(f"{annotation['source']} {error}: mend it, or delete it") from error
     if all(annotation.get("iscrowd") for annotation in annotations):
@@ -95,7 +95,7 @@ def _checked_annotations(data: dict[str, Any], path: Path, labels: Sequence[str]
     return {"images": images, "annotations": annotations, "summary": summary}
 
 
-def _checked_image(image: dict[str, Any], index: int) -> dict[str, Any]:
+def _check_image(image: dict[str, Any], index: int) -> dict[str, Any]:
     """Return the entry of an image, with its width and height as integers.
 
     Args:
@@ -112,7 +112,7 @@ def _checked_image(image: dict[str, Any], index: int) -> dict[str, Any]:
         raise RequestError(
             f"{image['source']}: image number {index + 1} has the file_name {reprlib.repr(name)}: name a file in that folder"
         )
-    sides = _numbers([image.get("width"), image.get("height")])
+    sides = _finite_numbers([image.get("width"), image.get("height")])
     if sides is None or min(sides) < 1 or any(side % 1 for side in sides):
         said = f"{reprlib.repr(image.get('width'))} and {reprlib.repr(image.get('height'))}"
         raise RequestError(f"{image['source']}: image {name} needs a width and a height in pixels, not {said}")
@@ -129,7 +129,7 @@ def _is_inside(name: str) -> bool:
     return bool(steps) and not path.anchor and ".." not in steps and name == readable(name)
 
 
-def _checked_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple[int, int]]) -> dict[str, Any]:
+def _check_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple[int, int]]) -> dict[str, Any]:
     """Return an annotation with a validated ``bbox`` and ``segmentation`` (None if it has none).
 
     A missing box is computed from the segmentation.
@@ -146,9 +146,9 @@ def _checked_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple
     if not isinstance(number, (int, str)) or number not in sizes:
         raise ValueError(f"has the image_id {reprlib.repr(number)}, which no image has")
     height, width = sizes[number]
-    segmentation = _checked_segmentation(annotation.get("segmentation"), (height, width))
+    segmentation = _check_segmentation(annotation.get("segmentation"), (height, width))
     if annotation.get("bbox") is not None:
-        box = _numbers(annotation["bbox"])
+        box = _finite_numbers(annotation["bbox"])
     elif segmentation:
         box = _box_around(segmentation)
     else:
@@ -165,7 +165,7 @@ def _checked_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple
     return {**annotation, "bbox": box, "segmentation": segmentation}
 
 
-def _checked_segmentation(segmentation: Any, size: tuple[int, int]) -> dict[str, Any] | list[list[float]] | None:
+def _check_segmentation(segmentation: Any, size: tuple[int, int]) -> dict[str, Any] | list[list[float]] | None:
     """Return uncompressed runs that cover an image of ``size`` (height, width), or polygons; None if there is neither.
 
     Raises:
@@ -174,22 +174,22 @@ def _checked_segmentation(segmentation: Any, size: tuple[int, int]) -> dict[str,
     if not segmentation:
         return None
     if isinstance(segmentation, dict):
-        said, counts = _numbers(segmentation.get("size")), segmentation.get("counts")
+        said, counts = _finite_numbers(segmentation.get("size")), segmentation.get("counts")
         if said is None or len(said) != 2 or not isinstance(counts, (str, list)):
             raise ValueError("has a mask without size (height, width) and counts")
         if tuple(said) != size:
             raise ValueError(f"has a mask of {said[1]:g} x {said[0]:g} pixels, but its image has {size[1]} x {size[0]}")
         try:
-            numbers = decode_counts(counts) if isinstance(counts, str) else _numbers(counts)
+            numbers = decode_counts(counts) if isinstance(counts, str) else _finite_numbers(counts)
             if numbers is None:
                 raise ValueError("counts are not numbers")
-            runs = covering(numbers, *size)
+            runs = check_runs(numbers, *size)
         except (ValueError, OverflowError) as error:
             raise ValueError(f"has a mask that cannot be read ({error})") from error
         if not runs[1::2].any():
             raise ValueError("has a mask without a pixel")
         return {"size": list(size), "counts": runs.tolist()}
-    outlines = [_numbers(outline) for outline in segmentation] if isinstance(segmentation, list) else [None]
+    outlines = [_finite_numbers(outline) for outline in segmentation] if isinstance(segmentation, list) else [None]
     corners = [outline for outline in outlines if outline is not None and len(outline) >= 6 and len(outline) % 2 == 0]
     if len(corners) < len(outlines):
         raise ValueError("has a polygon that is not column, line, column, line, ... of 3 corners or more")
@@ -198,7 +198,7 @@ def _checked_segmentation(segmentation: Any, size: tuple[int, int]) -> dict[str,
     return corners
 
 
-def _numbers(values: Any) -> list[float] | None:
+def _finite_numbers(values: Any) -> list[float] | None:
     """Return a list of finite numbers as floats; None if ``values`` is anything else."""
     try:
         numbers = np.asarray(values, float)

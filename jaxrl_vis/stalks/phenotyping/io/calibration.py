@@ -20,7 +20,12 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import Size, UnrectifiedPair
-from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import both_sides, files_in, named_pair, read_cameras
+from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import (
+    calibration_files,
+    find_pair_file,
+    find_side_files,
+    read_cameras,
+)
 from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import readable
 from jaxrl_vis.stalks.phenotyping.io.units import baseline_in_metres
@@ -35,23 +40,23 @@ def read_calibration(path: Path, unit: str | None = None, image: Path | None = N
 
     Args:
         path: A file of any of these programs, or a folder that holds one for both cameras or one for each.
-        unit: Unit of the baseline, see `in_metres`; None for the unit that the file states or its program uses, by default
-            metres.
+        unit: Unit of the baseline, see `units.baseline_in_metres`; None for the unit that the file states or its program uses,
+            by default metres.
         image: A left image of the cameras, whose size is used if the file covers several sizes or states none.
 
     Raises:
-        RequestError: There is no such file, it does not describe a pair of rectified cameras, or its baseline is implausible in
-            that unit.
+        RequestError: There is no such file, it does not describe a pair of rectified cameras, its image size is unknown, or its
+            baseline is implausible in that unit.
     """
     cameras = read_cameras(path, image)
-    pair = cameras.if_rectified() if isinstance(cameras, UnrectifiedPair) else cameras
+    pair = cameras.to_rectified() if isinstance(cameras, UnrectifiedPair) else cameras
     if pair is None:
         raise RequestError(
             f"{path} is of {cameras.program} and says how the cameras were built, not how their images were rectified: rectify "
             "them with cv2.stereoRectify, and name the P1 and P2 that it returns"
         )
     size = pair.size or _size_by_image(path, pair.left, image)
-    return _checked(path, pair.left, pair.right, size, unit or pair.unit or "m")
+    return _check_pair(path, pair.left, pair.right, size, unit or pair.unit or "m")
 
 
 def _size_by_image(path: Path, left: np.ndarray, image: Path | None) -> Size:
@@ -83,11 +88,11 @@ def _size_by_image(path: Path, left: np.ndarray, image: Path | None) -> Size:
 
 def find_calibration(folder: Path) -> Path | None:
     """Return the calibration file in a folder of images, or that of the left camera; None if there is none."""
-    files = files_in(folder)
-    named = named_pair(files)
+    files = calibration_files(folder)
+    named = find_pair_file(files)
     if named is not None:
         return named
-    sides = (both_sides(file) for file in files if file.suffix.lower() in (".yaml", ".yml", ".ini"))
+    sides = (find_side_files(file) for file in files if file.suffix.lower() in (".yaml", ".yml", ".ini"))
     return next((left for left, _ in filter(None, sides)), None)
 
 
@@ -126,7 +131,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     write_atomically(path, store.releaseAndGetString())
 
 
-def _checked(path: Path, left: np.ndarray, right: np.ndarray, size: tuple[int, int], unit: str) -> Calibration:
+def _check_pair(path: Path, left: np.ndarray, right: np.ndarray, size: tuple[int, int], unit: str) -> Calibration:
     width, height = size
     focal = float(left[0, 0])
     if width < 1 or height < 1 or not 0.1 * width < focal < 50 * width:

@@ -14,13 +14,13 @@ from pathlib import Path, PureWindowsPath
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import check_length, readable
-from jaxrl_vis.stalks.phenotyping.io.naming.sides import partners
-from jaxrl_vis.stalks.phenotyping.io.naming.stamps import nearest, seconds_in
+from jaxrl_vis.stalks.phenotyping.io.naming.sides import partner_names
+from jaxrl_vis.stalks.phenotyping.io.naming.stamps import match_nearest, parse_timestamp
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm"}
 SAMPLE = Path(__file__).parents[1] / "sample_row"
 """Folder of a short synthetic row that ships with the package."""
-_DEPTH = 6  # levels of nested folders searched for plots
+_MAX_DEPTH = 6  # levels of nested folders searched for plots
 _MAX_FOLDERS = 20_000
 _MAX_DELAY = 0.005  # s, maximum median delay between the images of a pair: a robot at 0.3 m/s drives 1.5 mm
 _DISPARITIES = {".pfm", ".png", ".tif", ".tiff"}
@@ -87,7 +87,7 @@ def find_plots(folder: Path, patterns: Patterns | None = None) -> list[PlotFolde
     for pattern in () if patterns is None else (patterns.left, patterns.right):
         if not pattern or PureWindowsPath(pattern).anchor or ".." in PureWindowsPath(pattern).parts:
             raise RequestError(f"--left and --right are patterns within each plot's folder, as 'left/*.png', not {pattern!r}")
-    own = _pairs(folder, patterns)
+    own = _find_pairs(folder, patterns)
     folders = {folder: own} if own else _search_subfolders(folder, patterns)
     plots: dict[str, PlotFolder] = {}
     for path, pairs in folders.items():
@@ -98,36 +98,36 @@ def find_plots(folder: Path, patterns: Patterns | None = None) -> list[PlotFolde
             raise RequestError(f"{readable(str(folder))} holds two plots called {name}: rename one of them")
         plots[name] = PlotFolder(name, path, pairs)
     if not plots:
-        raise RequestError(_no_pairs(folder, patterns))
+        raise RequestError(_no_pairs_message(folder, patterns))
     return list(plots.values())
 
 
 def _search_subfolders(folder: Path, patterns: Patterns | None) -> dict[Path, tuple[PairFiles, ...]]:
-    """Return the pairs of all subfolders that hold some, depth first; folders inside those are not searched.
+    """Return the pairs of all subfolders that hold some, up to `_MAX_DEPTH` levels deep; folders inside those are not searched.
 
     Raises:
         RequestError: There are more than 20,000 folders.
     """
     plots: dict[Path, tuple[PairFiles, ...]] = {}
-    waiting, count = [(path, 1) for path in _folders(folder)], 0
+    waiting, count = [(path, 1) for path in _subfolders(folder)], 0
     while waiting:
         path, depth = waiting.pop(0)
         count += 1
         if count > _MAX_FOLDERS:
             raise RequestError(f"{readable(str(folder))} holds more than {_MAX_FOLDERS} folders: name one with plots")
-        pairs = _pairs(path, patterns)
+        pairs = _find_pairs(path, patterns)
         if pairs:
             plots[path] = pairs
-        elif depth < _DEPTH:
-            waiting = [(inside, depth + 1) for inside in _folders(path)] + waiting
+        elif depth < _MAX_DEPTH:
+            waiting = [(inside, depth + 1) for inside in _subfolders(path)] + waiting
     return plots
 
 
-def _folders(folder: Path) -> list[Path]:
+def _subfolders(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
 
 
-def _no_pairs(folder: Path, patterns: Patterns | None) -> str:
+def _no_pairs_message(folder: Path, patterns: Patterns | None) -> str:
     """Return the message that a folder holds no pairs, with a hint at the likely reason."""
     if patterns is not None:
         return f"{folder} holds no images for --left {patterns.left!r} and --right {patterns.right!r}, nor do folders in it"
@@ -151,7 +151,7 @@ _Sides = dict[str, dict[str, Path]]
 """Files by name of their pair and role: left, right or disparity."""
 
 
-def _pairs(folder: Path, patterns: Patterns | None) -> tuple[PairFiles, ...]:
+def _find_pairs(folder: Path, patterns: Patterns | None) -> tuple[PairFiles, ...]:
     if patterns is not None:
         sides = _pair_by_patterns(folder, patterns)
     else:
@@ -193,7 +193,7 @@ def _pair_by_patterns(folder: Path, patterns: Patterns) -> _Sides:
     """Find the images that match two patterns; the text matched by the wildcards is the name of the pair."""
     sides: _Sides = {}
     for side, pattern in (("left", patterns.left), ("right", patterns.right)):
-        stars = _stars(pattern)
+        stars = _compile_pattern(pattern)
         for path in sorted(folder.glob(pattern)):
             match = stars.fullmatch(path.relative_to(folder).as_posix())
             if path.is_file() and not path.name.startswith(".") and match is not None:
@@ -202,7 +202,7 @@ def _pair_by_patterns(folder: Path, patterns: Patterns) -> _Sides:
     return sides if any("left" in files for files in sides.values()) else {}
 
 
-def _stars(pattern: str) -> re.Pattern[str]:
+def _compile_pattern(pattern: str) -> re.Pattern[str]:
     """Compile a glob pattern to a regular expression with a group for each wildcard."""
     parts = {"**/": r"((?:.*/)?)", "*": r"([^/]*)", "?": r"([^/])"}
     words = re.split(r"(\*\*/|\*|\?|\[[^\]]*\])", pattern)
@@ -226,15 +226,18 @@ def _pair_by_times(folder: Path, sides: _Sides) -> _Sides:
         folder: The folder, for messages.
         sides: Files by name of their pair; modified in place if all unpaired names are timestamps, unchanged otherwise.
 
+    Returns:
+        ``sides``.
+
     Raises:
         RequestError: The images of a pair are so far apart in time that the robot has moved.
     """
     alone = {side: [name for name, files in sides.items() if set(files) == {side}] for side in ("left", "right")}
-    times = {side: {name: seconds_in(sides[name][side].stem) for name in names} for side, names in alone.items()}
+    times = {side: {name: parse_timestamp(sides[name][side].stem) for name in names} for side, names in alone.items()}
     if not all(times.values()) or any(time is None for by_name in times.values() for time in by_name.values()):
         return sides
     left, right = ({name: time or 0.0 for name, time in times[side].items()} for side in ("left", "right"))
-    partner = nearest(left, right)
+    partner = match_nearest(left, right)
     apart = sorted(abs(left[name] - right[other]) for name, other in partner.items())
     if apart and apart[len(apart) // 2] > _MAX_DELAY:
         raise RequestError(
@@ -252,25 +255,25 @@ def _pair_by_folder(folder: Path) -> _Sides:
     Raises:
         RequestError: There are several pairs of such folders.
     """
-    nested = {path: _side_images(path) for path in _folders(folder)}
+    nested = {path: _side_images(path) for path in _subfolders(folder)}
     names = {path.name.lower(): path for path, images in nested.items() if images}
     pairs = [tuple(names[name] for name in both) for both in (("left", "right"), ("l", "r")) if set(both) <= set(names)][:1]
     if not pairs:
         candidates = {
             (path, names[other.lower()]) if side == "left" else (names[other.lower()], path)
             for path in names.values()
-            for side, other in partners(path.name)
+            for side, other in partner_names(path.name)
             if other.lower() in names
         }
         # A folder that holds whole pairs is a plot, not a side.
-        pairs = sorted(pair for pair in candidates if not any(_whole_pairs(path) for path in pair))
+        pairs = sorted(pair for pair in candidates if not any(_has_pairs(path) for path in pair))
     if len(pairs) > 1:
         both = " and of ".join(f"{readable(left.name)} and {readable(right.name)}" for left, right in pairs[:2])
         raise RequestError(f"{readable(str(folder))} holds pairs of {both}: say which with --left 'PATTERN' --right 'PATTERN'")
     sides: _Sides = {}
     for side, path in zip(("left", "right"), pairs[0] if pairs else ()):
         # A folder L that holds whole pairs is a plot of that name, not a side.
-        if _whole_pairs(path):
+        if _has_pairs(path):
             return {}
         for image in nested[path]:
             _add_pair(sides, readable(image.stem), side, image)
@@ -283,7 +286,7 @@ def _side_images(folder: Path) -> list[Path]:
     return images or (image_files(inside) if inside.is_dir() else [])
 
 
-def _whole_pairs(folder: Path) -> bool:
+def _has_pairs(folder: Path) -> bool:
     return any(len(by_side) == 2 for by_side in _pair_by_name(folder).values())
 
 
@@ -312,13 +315,16 @@ def _pair_by_counter(stem: str, stems: set[str]) -> list[tuple[str, str]]:
     im0 and im1 are a pair, but im0 to im7 are the images of one camera.
 
     Args:
-        stem: Stem of its name.
+        stem: Stem of the image's name.
         stems: Lower-case stems of all images in its folder.
+
+    Returns:
+        At most one side (left or right) and stem of the partner.
     """
-    matches = [(side, other) for side, other in partners(stem, files=True) if other.lower() in stems]
+    matches = [(side, other) for side, other in partner_names(stem, files=True) if other.lower() in stems]
     if len(matches) != 1:
         return []
-    back = [other for _, other in partners(matches[0][1], files=True) if other.lower() in stems]
+    back = [other for _, other in partner_names(matches[0][1], files=True) if other.lower() in stems]
     return matches if len(back) == 1 else []
 
 
@@ -330,7 +336,7 @@ def _match_side(stem: str, stems: set[str]) -> re.Match[str] | None:
     as names usually begin with the plot.
 
     Args:
-        stem: Stem of its name.
+        stem: Stem of the image's name.
         stems: Lower-case stems of all images in its folder.
     """
     words = list(_WORD.finditer(stem)) or list(_LETTER.finditer(stem))

@@ -16,7 +16,7 @@ _WIDTH, _HEIGHT, _TILE_WIDTH, _TILE_HEIGHT = 256, 257, 322, 323  # TIFF tags
 _FINEST_TILES = 1024  # pixels, maximum side of tiles that exceed their image
 
 
-def size_in(file: BinaryIO) -> tuple[int, int] | None:
+def read_header_size(file: BinaryIO) -> tuple[int, int] | None:
     """Return the height and width of a PNG, JPEG, TIFF, BMP, PGM, PPM or PFM image; None if it is none of these, or damaged.
 
     Args:
@@ -28,9 +28,9 @@ def size_in(file: BinaryIO) -> tuple[int, int] | None:
         sides = int.from_bytes(begin[20:24], "big"), int.from_bytes(begin[16:20], "big")
         return sides if begin[12:16] == b"IHDR" and min(sides) > 0 else None
     if begin.startswith(b"\xff\xd8"):
-        return _jpeg(file.read())
+        return _jpeg_size(file.read())
     if begin[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-        return _tiff(file)
+        return _tiff_size(file)
     if begin.startswith(b"BM") and len(begin) >= 26 and int.from_bytes(begin[14:18], "little") in _BITMAPS:
         width, height = (int.from_bytes(begin[place : place + 4], "little", signed=True) for place in (18, 22))
         return (abs(height), width) if width > 0 and height else None  # height is negative for top-down rows
@@ -38,7 +38,7 @@ def size_in(file: BinaryIO) -> tuple[int, int] | None:
     return (int(match[2]), int(match[1])) if match and int(match[1]) and int(match[2]) else None
 
 
-def plain_png(data: bytes) -> bytes | None:
+def strip_png(data: bytes) -> bytes | None:
     """Strip a PNG of all chunks but those of its pixels and their colours; return None if it is damaged.
 
     OpenCV allocates as much memory as any chunk claims to need, and the other chunks are not needed here.
@@ -57,7 +57,7 @@ def plain_png(data: bytes) -> bytes | None:
     return None
 
 
-def _jpeg(data: bytes) -> tuple[int, int] | None:
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
     place = 2
     while True:
         place = data.find(b"\xff", place)  # decoders skip garbage between markers
@@ -74,7 +74,7 @@ def _jpeg(data: bytes) -> tuple[int, int] | None:
         place += 2 if marker in _ALONE or marker == 0 else 2 + length
 
 
-def _tiff(file: BinaryIO) -> tuple[int, int] | None:
+def _tiff_size(file: BinaryIO) -> tuple[int, int] | None:
     """Return the size in the first directory; None if it is missing or malformed, or if tiles are far larger than the image."""
     try:
         head = file.read(8)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from jaxrl_vis.host.files import replacing
-from jaxrl_vis.stalks.phenotyping.io.image_headers import PNG, plain_png, size_in
+from jaxrl_vis.stalks.phenotyping.io.image_headers import PNG, read_header_size, strip_png
 from jaxrl_vis.stalks.phenotyping.io.orientation import read_orientation, upright
 
 ImageFormat = Literal["png", "tiff", "jpeg"]
@@ -57,7 +57,7 @@ def _header(path: Path) -> tuple[tuple[int, int], int]:
         path.stat()
         raise _unreadable(path, "is no ordinary file")
     with path.open("rb") as file:
-        size = size_in(file)
+        size = read_header_size(file)
         file.seek(0)
         orientation = read_orientation(file)
     if size is None:
@@ -74,8 +74,8 @@ def read_image(path: Path) -> np.ndarray:
     """Read an image as [H, W, 3] (RGB) or [H, W], uint8 or uint16, rotated by its EXIF orientation; alpha is dropped.
 
     Raises:
-        OSError: The file cannot be read, is not a complete image, or has another pixel type. The message is one line that
-            names the file.
+        OSError: The file cannot be read, is not a complete image, has more than `MAX_PIXELS` pixels, or has another pixel type.
+            The message is one line that names the file.
     """
     image = _decode(path)
     if image is None:
@@ -88,7 +88,7 @@ def read_image(path: Path) -> np.ndarray:
     return cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2RGB)  # OpenCV's decoders return 1, 3 or 4 channels
 
 
-def rgb8(image: np.ndarray) -> np.ndarray:
+def to_rgb8(image: np.ndarray) -> np.ndarray:
     """Convert an image from `read_image` to RGB [H, W, 3] uint8.
 
     Cameras with 10, 12 or 14 bits write 16-bit files with the upper bits zero: the bit depth is taken to be the lowest of
@@ -101,7 +101,7 @@ def rgb8(image: np.ndarray) -> np.ndarray:
 
 
 def read_disparity(path: Path, scale: float = 256.0) -> np.ndarray:
-    """Read disparities from a file: PFM, floating-point TIFF, or 16-bit PNG or TIFF.
+    """Read disparities from a file of one channel: PFM, floating-point TIFF, or PNG or TIFF with 16 bits or more.
 
     Args:
         path: The file. Non-finite values and values up to 0 mark missing disparities.
@@ -129,7 +129,7 @@ def _decode(path: Path) -> np.ndarray | None:
     size, orientation = _header(path)
     data: bytes | None = path.read_bytes()
     if data.startswith(PNG):
-        data = plain_png(data)
+        data = strip_png(data)
     if not data:
         return None
     try:

@@ -43,11 +43,11 @@ def decode_mask(runs: dict[str, Any]) -> np.ndarray:
         ValueError: The runs do not cover the image.
     """
     height, width = runs["size"]
-    counts = covering(runs["counts"], height, width)
+    counts = check_runs(runs["counts"], height, width)
     return np.repeat(np.arange(counts.size) % 2 == 1, counts).reshape(width, height).T
 
 
-def covering(counts: Sequence[float], height: int, width: int) -> np.ndarray:
+def check_runs(counts: Sequence[float], height: int, width: int) -> np.ndarray:
     """Validate the runs of an image and return them as [N] int64.
 
     Raises:
@@ -59,7 +59,7 @@ def covering(counts: Sequence[float], height: int, width: int) -> np.ndarray:
     return numbers.astype(np.int64)
 
 
-def outlined_mask(outlines: list[list[float]], size: tuple[int, int]) -> np.ndarray:
+def rasterise_polygons(outlines: list[list[float]], size: tuple[int, int]) -> np.ndarray:
     """Rasterise polygons to a mask [H, W] bool: the pixels whose centre lies inside any of them (by the even-odd rule).
 
     The mean number of mask pixels per row thus equals the width of a strip; filling the boundary, too, as OpenCV does, would
@@ -120,7 +120,7 @@ def box_around_runs(counts: np.ndarray, height: int) -> list[float]:
     """Return the bounding box (left, top, width, height) of a mask from its runs alone, without decoding it.
 
     Args:
-        counts: Runs [N] int64 from `covering`, at least one foreground run of which is not empty.
+        counts: Runs [N] int64 from `check_runs`, at least one foreground run of which is not empty.
         height: Height of the image.
     """
     ends = np.cumsum(counts)[1::2]

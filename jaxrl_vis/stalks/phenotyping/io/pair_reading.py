@@ -7,7 +7,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles
-from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_disparity, read_image, rgb8
+from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_disparity, read_image, to_rgb8
 from jaxrl_vis.stalks.phenotyping.io.names import readable
 from jaxrl_vis_envs.plants import Calibration
 
@@ -15,7 +15,7 @@ Side = Literal["left", "right"]
 T = TypeVar("T")
 
 
-class Unusable(Exception):
+class UnusablePairError(Exception):
     """Raised for a pair that cannot be used; the message states the reason."""
 
 
@@ -25,7 +25,7 @@ def read_pair(pair: PairFiles, calibration: Calibration | None, right_needed: bo
     Args:
         pair: Files of the pair.
         calibration: Calibration whose size the images must have; None to accept any size.
-        right_needed: If false, the left image is also returned for a missing right one.
+        right_needed: If false and the pair has no right image, the left one is returned in both places.
 
     Raises:
         Unusable: An image is missing, unreadable or black, or the sizes do not match.
@@ -34,16 +34,20 @@ def read_pair(pair: PairFiles, calibration: Calibration | None, right_needed: bo
     # Checked before decoding: a small file may hold more pixels than fit into memory.
     sizes = [_read_side_file(pair, side, image_size) for side in sides]
     if sizes[0] != sizes[-1]:
-        raise Unusable(f"the left image has {_size(sizes[0])} pixels and the right one {_size(sizes[-1])}")
+        raise UnusablePairError(
+            f"the left image has {_format_size(sizes[0])} pixels and the right one {_format_size(sizes[-1])}"
+        )
     if calibration is not None and sizes[0] != (calibration.height, calibration.width):
         wanted = f"{calibration.width} x {calibration.height}"
-        raise Unusable(f"the images have {_size(sizes[0])} pixels, but the calibration is for {wanted}")
+        raise UnusablePairError(f"the images have {_format_size(sizes[0])} pixels, but the calibration is for {wanted}")
     images = [read_side(pair, side) for side in sides]
     left, right = images[0], images[-1]
     if left.shape != right.shape:  # the file was replaced in the meantime
-        raise Unusable(f"the left image has {_size(left.shape)} pixels and the right one {_size(right.shape)}")
+        raise UnusablePairError(
+            f"the left image has {_format_size(left.shape)} pixels and the right one {_format_size(right.shape)}"
+        )
     if min(int(left.max()), int(right.max())) < 8:
-        raise Unusable(f"the {'left' if left.max() < 8 else 'right'} image is black")
+        raise UnusablePairError(f"the {'left' if left.max() < 8 else 'right'} image is black")
     return left, right
 
 
@@ -53,7 +57,7 @@ def read_side(pair: PairFiles, side: Side) -> np.ndarray:
     Raises:
         Unusable: It is missing or unreadable.
     """
-    return rgb8(_read_side_file(pair, side, read_image))
+    return to_rgb8(_read_side_file(pair, side, read_image))
 
 
 def _read_side_file(pair: PairFiles, side: Side, read: Callable[[Path], T]) -> T:
@@ -64,20 +68,22 @@ def _read_side_file(pair: PairFiles, side: Side, read: Callable[[Path], T]) -> T
     """
     path = pair.left if side == "left" else pair.right
     if path is None:
-        raise Unusable(f"there is no {side} image")
+        raise UnusablePairError(f"there is no {side} image")
     try:
         return read(path)
     except OSError as error:
-        raise Unusable(f"{readable(path.name)}: {error.strerror or 'it is not an image, or only a part of one'}") from error
+        raise UnusablePairError(
+            f"{readable(path.name)}: {error.strerror or 'it is not an image, or only a part of one'}"
+        ) from error
 
 
-def known_disparity(pair: PairFiles, left: np.ndarray, scale: float) -> np.ndarray | None:
+def read_known_disparity(pair: PairFiles, left: np.ndarray, scale: float) -> np.ndarray | None:
     """Read precomputed disparities of the left image, [H, W] float32 in pixels, NaN where missing; None if there is no file.
 
     Args:
         pair: Files of the pair.
         left: Left image, [H, W, 3].
-        scale: Divisor of 16-bit values, see `read_disparity`.
+        scale: Divisor of integer values, see `read_disparity`.
 
     Raises:
         Unusable: The file cannot be read, or its size is not that of the image.
@@ -89,9 +95,9 @@ def known_disparity(pair: PairFiles, left: np.ndarray, scale: float) -> np.ndarr
         if size == left.shape[:2]:
             return read_disparity(pair.disparity, scale)
     except OSError as error:
-        raise Unusable(f"{readable(pair.disparity.name)}: {error.strerror or 'it holds no disparities'}") from error
-    raise Unusable(f"the left image has {_size(left.shape)} pixels and its disparities {_size(size)}")
+        raise UnusablePairError(f"{readable(pair.disparity.name)}: {error.strerror or 'it holds no disparities'}") from error
+    raise UnusablePairError(f"the left image has {_format_size(left.shape)} pixels and its disparities {_format_size(size)}")
 
 
-def _size(shape: tuple[int, ...]) -> str:
+def _format_size(shape: tuple[int, ...]) -> str:
     return f"{shape[1]} x {shape[0]}"

@@ -24,13 +24,13 @@ from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.provenance import install_command
 from jaxrl_vis.stalks.phenotyping.io.image_headers import PNG
 from jaxrl_vis.stalks.phenotyping.io.images import MAX_PIXELS, write_image
-from jaxrl_vis.stalks.phenotyping.io.naming.sides import partners
+from jaxrl_vis.stalks.phenotyping.io.naming.sides import partner_names
 
 _SUFFIXES = (".bag", ".mcap", ".db3")
 _IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _CAMERA = "sensor_msgs/msg/CameraInfo"
 _ODOMETRY = ("nav_msgs/msg/Odometry", "sensor_msgs/msg/NavSatFix")
-_PLAIN = {"mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1, "rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "8UC3": 3}
+_CHANNELS = {"mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1, "rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "8UC3": 3}
 """Number of channels by image encoding."""
 _MOSAICS = {
     "bayer_rggb8": cv2.COLOR_BayerRGGB2RGB,
@@ -38,7 +38,7 @@ _MOSAICS = {
     "bayer_gbrg8": cv2.COLOR_BayerGBRG2RGB,
     "bayer_grbg8": cv2.COLOR_BayerGRBG2RGB,
 }
-_SHOWN = 8
+_MAX_LISTED = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ def is_recording(path: Path) -> bool:
     return about.is_file() and about.open("rb").read(1000).lstrip().startswith(b"rosbag2_bagfile_information")
 
 
-def take_apart(path: Path, out: Path, topics: Topics | None = None) -> Path:
+def extract_recording(path: Path, out: Path, topics: Topics | None = None) -> Path:
     """Extract the stereo images, calibrations and odometry of a recording to the folder of a plot.
 
     A folder that is complete, of the same recording and topics, is left alone; any other folder of this name is replaced.
@@ -102,7 +102,7 @@ def _write_all(path: Path, folder: Path, topics: Topics | None) -> None:
 
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         kinds: dict[str, str] = {connection.topic: connection.msgtype for connection in reader.connections}
-        pair = topics or _topic_pair(kinds, path)
+        pair = topics or _find_topics(kinds, path)
         for topic in (pair.left, pair.right):
             if kinds.get(topic) not in _IMAGE:
                 raise RequestError(f"{path} has no images on {topic}: {_format_topics(kinds)}")
@@ -120,35 +120,37 @@ def _write_all(path: Path, folder: Path, topics: Topics | None) -> None:
         _write_odometry(folder / "odometry.csv", kinds, messages)
 
 
-def _topic_pair(kinds: dict[str, str], path: Path) -> Topics:
+def _find_topics(message_types: dict[str, str], path: Path) -> Topics:
     """Find the topics of the left and right images.
 
     Args:
-        kinds: Message type by topic.
+        message_types: Message type by topic.
         path: The recording, for messages.
 
     Raises:
         RequestError: There is no pair of topics, or several.
     """
-    images = [topic for topic, kind in kinds.items() if kind in _IMAGE and "depth" not in topic]
-    pairs = {Topics(topic, other) for topic in images for side, other in partners(topic) if side == "left" and other in images}
+    images = [topic for topic, kind in message_types.items() if kind in _IMAGE and "depth" not in topic]
+    pairs = {
+        Topics(topic, other) for topic in images for side, other in partner_names(topic) if side == "left" and other in images
+    }
     for word in ("rect", "compressed"):
         # Prefer rectified to raw images, then uncompressed to compressed ones.
         best = {pair for pair in pairs if (word in pair.left) == (word == "rect")}
         pairs = best or pairs
     if len(pairs) != 1:
         what = "several pairs of images" if pairs else "no pair of left and right images"
-        raise RequestError(f"{path} has {what}: say --left TOPIC --right TOPIC; {_format_topics(kinds)}")
+        raise RequestError(f"{path} has {what}: say --left TOPIC --right TOPIC; {_format_topics(message_types)}")
     return pairs.pop()
 
 
-def _format_topics(kinds: dict[str, str]) -> str:
-    images = sorted(topic for topic, kind in kinds.items() if kind in _IMAGE)
-    others = f" and {len(images) - _SHOWN} others" if len(images) > _SHOWN else ""
-    return f"images are on {', '.join(images[:_SHOWN])}{others}" if images else "no topic has images"
+def _format_topics(message_types: dict[str, str]) -> str:
+    images = sorted(topic for topic, kind in message_types.items() if kind in _IMAGE)
+    others = f" and {len(images) - _MAX_LISTED} others" if len(images) > _MAX_LISTED else ""
+    return f"images are on {', '.join(images[:_MAX_LISTED])}{others}" if images else "no topic has images"
 
 
-def _write_camera(path: Path, topic: str, kinds: dict[str, str], messages: Any) -> None:
+def _write_camera(path: Path, topic: str, message_types: dict[str, str], messages: Any) -> None:
     """Write the first camera_info message that belongs to an image topic, if there is one.
 
     Raises:
@@ -157,7 +159,7 @@ def _write_camera(path: Path, topic: str, kinds: dict[str, str], messages: Any) 
     """
     parts = topic.split("/")
     named = ["/".join([*parts[:length], "camera_info"]) for length in range(len(parts) - 1, 0, -1)]
-    info = next((name for name in named if kinds.get(name) == _CAMERA), None)
+    info = next((name for name in named if message_types.get(name) == _CAMERA), None)
     message = None if info is None else next(messages(info), None)
     if message is None:
         return
@@ -194,10 +196,10 @@ def _write_message(folder: Path, message: Any, source: str) -> None:
         write_atomically(folder / f"{name}{suffix}", data)
         return
     folder.mkdir(parents=True, exist_ok=True)
-    write_image(folder / f"{name}.png", _pixels(message, source))
+    write_image(folder / f"{name}.png", _decode_pixels(message, source))
 
 
-def _pixels(message: Any, source: str) -> np.ndarray:
+def _decode_pixels(message: Any, source: str) -> np.ndarray:
     """Decode an Image message to [H, W, 3] (RGB) or [H, W], uint8 or uint16.
 
     Args:
@@ -208,9 +210,9 @@ def _pixels(message: Any, source: str) -> np.ndarray:
         RequestError: The encoding is not supported, or the data do not match the size.
     """
     encoding, height, width, step = str(message.encoding), int(message.height), int(message.width), int(message.step)
-    channels, deep = _PLAIN.get(encoding, 1), "16" in encoding
-    if encoding not in _PLAIN and encoding not in _MOSAICS:
-        raise RequestError(f"{source}: images are encoded as {encoding[:40]}; {', '.join((*_PLAIN, *_MOSAICS))} can be read")
+    channels, deep = _CHANNELS.get(encoding, 1), "16" in encoding
+    if encoding not in _CHANNELS and encoding not in _MOSAICS:
+        raise RequestError(f"{source}: images are encoded as {encoding[:40]}; {', '.join((*_CHANNELS, *_MOSAICS))} can be read")
     row = width * channels * (2 if deep else 1)
     data = np.asarray(message.data, np.uint8)
     if not 0 < width * height <= MAX_PIXELS or step < row or data.size < step * height:
@@ -225,14 +227,14 @@ def _pixels(message: Any, source: str) -> np.ndarray:
     return lines if channels == 1 else np.ascontiguousarray(colours)
 
 
-def _write_odometry(path: Path, kinds: dict[str, str], messages: Any) -> None:
+def _write_odometry(path: Path, message_types: dict[str, str], messages: Any) -> None:
     """Write the robot's finite positions with timestamps in ns.
 
     They are read from the first Odometry topic, or else from the first NavSatFix topic (shortest name first); nothing is
     written if neither has any.
     """
     for kind, columns in zip(_ODOMETRY, ("x_m,y_m,z_m", "latitude,longitude")):
-        topics = sorted((topic for topic, of in kinds.items() if of == kind), key=lambda topic: (len(topic), topic))
+        topics = sorted((topic for topic, of in message_types.items() if of == kind), key=lambda topic: (len(topic), topic))
         if not topics:
             continue
         lines = [f"time_ns,{columns}"]

@@ -14,10 +14,10 @@ _DARK = 12  # maximum value in a border: JPEG edges ring
 _FILLED = 1.0  # maximum mean value of a border, away from its side
 _RINGING = 16  # pixels: reach of JPEG ringing into a border
 _MIN_LINES = 0.08  # minimum length of a border's side, as a fraction of the image's
-_BEND = 2.5  # pixels: maximum distance of a border's side from a smooth curve
+_MAX_RESIDUAL = 2.5  # pixels: maximum distance of a border's side from a smooth curve
 _MIN_AGREEING = 0.9  # minimum fraction of a side's rows that lie on the curve
-_MIN_THICKNESS = 8.0  # pixels: maximum width of a border at an end within the image
-_INSIDE = 2  # pixels by which a detected border is widened
+_MAX_END_WIDTH = 8.0  # pixels: maximum width of a border at an end within the image
+_WIDENING = 2  # pixels by which a detected border is widened
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,28 +65,38 @@ def _extent(image: np.ndarray, lit: Any, axis: int) -> tuple[int, int]:
     return first, last
 
 
-def _is_filled(part: np.ndarray) -> bool:
-    return bool(part.size) and float(part.mean()) <= _FILLED
+def _is_filled(border: np.ndarray) -> bool:
+    return bool(border.size) and float(border.mean()) <= _FILLED
 
 
 def _border_wedges(image: np.ndarray, dark: np.ndarray) -> np.ndarray:
-    """Return a mask [H, W] bool of the borders that do not extend along a whole side of the image."""
+    """Return a mask [H, W] bool of the borders that do not extend along a whole side of the image.
+
+    Args:
+        image: [H, W, 3] or [H, W] uint8.
+        dark: [H, W] bool, True where all channels are dark.
+    """
     outside = np.zeros(dark.shape, bool)
     for turns in range(4):
         turned, filled = np.rot90(dark, turns), np.rot90(image, turns)
-        reach = _side(turned, filled)
+        reach = _border_width(turned, filled)
         if reach is not None:
             wedge = np.arange(turned.shape[1]) < reach[:, None]
             outside |= np.rot90(wedge, -turns)
     return outside
 
 
-def _side(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
-    """Return the width [H] of a border at the left of each row, pixels; None if there is no border."""
+def _border_width(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
+    """Return the width [H] float64 of a border at the left of each row, pixels, 0 beyond its ends; None if there is no border.
+
+    Args:
+        dark: [H, W] bool, True where all channels are dark.
+        image: [H, W, 3] or [H, W] uint8.
+    """
     if np.count_nonzero(dark[:, 0]) < _MIN_LINES * dark.shape[0]:
         return None
     depth = np.where(dark.all(axis=1), 0, np.argmin(dark, axis=1))
-    there = np.flatnonzero(depth > _INSIDE)
+    there = np.flatnonzero(depth > _WIDENING)
     if there.size < max(_MIN_LINES * dark.shape[0], _RINGING):
         return None
     # Consider all rows between its ends, as a border is contiguous.
@@ -100,21 +110,25 @@ def _side(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
             return None
         curve = np.polyval(np.polyfit(place[heavy], reach[heavy], 2), place)
         # Dark objects next to the border make it look wider; nothing makes it look narrower.
-        heavy = np.abs(reach - curve) <= max(_BEND, float(np.quantile(np.abs(reach - curve), 0.5)))
+        heavy = np.abs(reach - curve) <= max(_MAX_RESIDUAL, float(np.quantile(np.abs(reach - curve), 0.5)))
     # A border extends to the adjacent sides of the image, or tapers off.
     ends = [curve[end] for end, complete in ((0, first == 0), (-1, last == dark.shape[0])) if not complete]
-    if np.mean(np.abs(reach - curve) <= _BEND) < _MIN_AGREEING or max(ends, default=0.0) > _MIN_THICKNESS:
+    if np.mean(np.abs(reach - curve) <= _MAX_RESIDUAL) < _MIN_AGREEING or max(ends, default=0.0) > _MAX_END_WIDTH:
         return None
     columns = np.zeros(dark.shape[0])
-    columns[first:last] = np.maximum(curve, 0.0) + _INSIDE
-    inner = np.arange(dark.shape[1]) < (columns - _INSIDE - _RINGING / 2)[:, None]
+    columns[first:last] = np.maximum(curve, 0.0) + _WIDENING
+    inner = np.arange(dark.shape[1]) < (columns - _WIDENING - _RINGING / 2)[:, None]
     if inner.any() and float(image[inner].mean()) > _FILLED:
         return None
     return columns
 
 
 def fill_borders(image: np.ndarray, frame: Frame) -> np.ndarray:
-    """Crop an image [H, W, 3] to the bounding box of its frame, and fill remaining borders with the nearest scene pixels."""
+    """Crop an image [H, W, 3] to the bounding box of its frame, and fill remaining borders with the nearest scene pixels.
+
+    Returns:
+        [h, w, 3], a view of the image if no border remains.
+    """
     part = image[slice(*frame.lines), slice(*frame.columns)]
     if frame.shown is None:
         return part

@@ -54,7 +54,7 @@ def edge_tilt(slope: float, disparity: float, calibration: Calibration) -> float
 
     Args:
         slope: Change of its disparity per row of the left image, pixels.
-        disparity: Disparity at the same place, pixels.
+        disparity: Disparity at the same point, pixels.
         calibration: Calibration of the cameras, whose offset is subtracted from the disparity.
     """
     beyond = disparity - calibration.offset

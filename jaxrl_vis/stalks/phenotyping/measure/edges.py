@@ -24,7 +24,7 @@ def refine_edges(strip: Strip, image: np.ndarray, corner: tuple[int, int], line:
 
     Args:
         strip: Edges of a mask.
-        image: Greyscale image [H, W].
+        image: Greyscale image [H, W], uint8 or float32.
         corner: Image row and column of the first pixel of the mask.
         line: Row of the mask around which the image is evaluated.
         reach: Distance above and below that row, pixels.

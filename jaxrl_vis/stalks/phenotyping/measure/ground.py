@@ -45,7 +45,13 @@ class Ground:
         return 1.0 / math.hypot(*self.normal)
 
     def height(self, column: float, line: float, depth: float, calibration: Calibration) -> float:
-        """Return the height above the ground, m, of a point at a pixel of the left image and a planar ``depth`` in m."""
+        """Return the height of a point above the ground, m.
+
+        Args:
+            column, line: Position in the left image, pixels.
+            depth: Planar depth, m.
+            calibration: Calibration of the cameras.
+        """
         x = (column - calibration.centre[0]) / calibration.focal
         y = (line - calibration.centre[1]) / calibration.focal
         across, down, forwards = self.normal
@@ -94,7 +100,7 @@ def find_ground(
         left, right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right))
     bounds = tuple(float(calibration.disparity(np.array(depth))) * scale for depth in reversed(depths))
     if disparity is None:
-        places, values = _windows(left, right, (bounds[0], bounds[1]))
+        places, values = _match_windows(left, right, (bounds[0], bounds[1]))
     else:
         places, values = _samples(disparity, scale)
     if len(values) < _MIN_WINDOWS:
@@ -106,7 +112,7 @@ def find_ground(
     unit = 1.0 / (focal * calibration.baseline)
     rays = np.concatenate([(places - centre) / focal, np.ones((len(places), 1))], axis=1)
     inverse = (values - calibration.offset * scale) * unit
-    fitted = _plane(rays, inverse, _TOLERANCE * unit)
+    fitted = _fit_plane(rays, inverse, _TOLERANCE * unit)
     if fitted is None:
         return None
     residual = inverse - rays @ fitted
@@ -119,8 +125,16 @@ def find_ground(
     return Ground((float(fitted[0]), float(fitted[1]), float(fitted[2])))
 
 
-def _windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Match windows in the right image; return the centres (x, y) [N, 2] and disparities [N] of those with a clear match."""
+def _match_windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Match a grid of windows of the left image in the right one.
+
+    Args:
+        left, right: Rectified greyscale images [H, W], uint8 or float32.
+        bounds: Minimum and maximum disparity, pixels.
+
+    Returns:
+        Centres (x, y) [N, 2] in the left image and disparities [N] of the windows with a clear match, pixels, float64.
+    """
     tall, wide = _WINDOW
     height, width = left.shape
     low, high = math.floor(bounds[0]), math.ceil(bounds[1])
@@ -146,7 +160,7 @@ def _windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -
 
 
 def _samples(disparity: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Sample positions and disparities, as returned by `_windows`, from a disparity image."""
+    """Sample positions [N, 2] and disparities [N], as in `_match_windows`, from disparities [H, W] in full-size pixels."""
     lines, columns = (np.linspace(0, size - 1, 64).astype(int) for size in disparity.shape)
     values = disparity[np.ix_(lines, columns)]
     line, column = np.nonzero(np.isfinite(values))
@@ -154,8 +168,14 @@ def _samples(disparity: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarra
     return places, values[line, column] * scale
 
 
-def _plane(rays: np.ndarray, inverse: np.ndarray, tolerance: float) -> np.ndarray | None:
-    """Fit the plausible ground plane [3] with the most inliers, by RANSAC; None if there is none."""
+def _fit_plane(rays: np.ndarray, inverse: np.ndarray, tolerance: float) -> np.ndarray | None:
+    """Fit the plausible ground plane [3] (see `Ground.normal`) with the most inliers, by RANSAC; None if there is none.
+
+    Args:
+        rays: [N, 3], directions to points, with z = 1.
+        inverse: [N], inverse planar depths of the points, 1/m.
+        tolerance: Maximum error of an inlier's inverse depth, 1/m.
+    """
     rng = np.random.default_rng(0)
     # Most of an image is not ground, but most of its lower third is: half of the samples come from there.
     low = np.flatnonzero(rays[:, 1] >= np.quantile(rays[:, 1], 2 / 3))

@@ -21,30 +21,30 @@ class LensRange:
     view: float
 
 
-TRIED = LensRange(pixels_per_metre=640.0, view=0.68)
+VALIDATED = LensRange(pixels_per_metre=640.0, view=0.68)
 """Range in which counts and widths are as good as with the standard lens: 5 % beyond the last such lenses of
 `benchmarks.stalks.lenses`, as rows are not exactly 0.8 m away."""
 
 
-def lens_fault(calibration: Calibration, distance: float, lines: int, tried: LensRange = TRIED) -> str | None:
+def lens_fault(calibration: Calibration, distance: float, lines: int, validated: LensRange = VALIDATED) -> str | None:
     """Return a message on why a lens is outside a range; None if it is within.
 
     Args:
         calibration: Calibration of the cameras.
         distance: Distance from the cameras to the row, m.
         lines: Height of the images without black borders, pixels.
-        tried: Range of validated lenses.
+        validated: Range of validated lenses.
     """
     pixels_per_metre = calibration.focal / distance
     view = lines / pixels_per_metre
-    if pixels_per_metre < tried.pixels_per_metre:
+    if pixels_per_metre < validated.pixels_per_metre:
         return (
             f"{pixels_per_metre:.0f} pixels per metre of a row {distance:.2f} m away, fewer than the "
-            f"{tried.pixels_per_metre:.0f} that were tried: use images of more pixels, a longer lens or a smaller distance"
+            f"{validated.pixels_per_metre:.0f} that were tried: use images of more pixels, a longer lens or a smaller distance"
         )
-    if view < tried.view:
+    if view < validated.view:
         return (
             f"its images show {view:.2f} m from top to bottom of a row {distance:.2f} m away, less than the "
-            f"{tried.view:.2f} m that were tried: use a wider lens or a greater distance"
+            f"{validated.view:.2f} m that were tried: use a wider lens or a greater distance"
         )
     return None

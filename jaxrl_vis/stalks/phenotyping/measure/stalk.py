@@ -10,7 +10,7 @@ from jaxrl_vis.stalks.phenotyping.measure.diameter import diameter_mm, edge_tilt
 from jaxrl_vis.stalks.phenotyping.measure.edges import refine_edges
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground
 from jaxrl_vis.stalks.phenotyping.measure.stereo import StalkDisparity, match_rows, sample_rows
-from jaxrl_vis.stalks.phenotyping.measure.width import Strip, ellipse_width, index_pairs, median, strip_near, strip_width
+from jaxrl_vis.stalks.phenotyping.measure.width import Strip, ellipse_width, fit_strip, fit_strip_near, index_pairs, median
 from jaxrl_vis_envs.plants import Calibration
 
 Method = Literal["strip", "ellipse"]
@@ -35,8 +35,8 @@ class Measurement:
         height: Height of the measurement above the ground, m; NaN if no ground is known.
         lean, tilt: Angles of the stalk against the vertical of the image (positive to the right) and away from the camera, rad.
         confidence: Confidence of the measurement, 0 to 1.
-        here: True if both edges are visible around the row. If False, the edges are extrapolated from the rest of the stalk,
-            which is usually partially occluded.
+        both_edges_visible: True if both edges are visible around the row. If False, the edges are extrapolated from the rest of
+            the stalk, which is usually partially occluded.
         reason: Reason why the stalk could not be measured; empty if it was.
     """
 
@@ -51,11 +51,11 @@ class Measurement:
     lean: float = math.nan
     tilt: float = 0.0
     confidence: float = 0.0
-    here: bool = True
+    both_edges_visible: bool = True
     reason: str = ""
 
 
-def measure(
+def measure_stalk(
     mask: np.ndarray,
     corner: tuple[int, int],
     left: np.ndarray,
@@ -85,7 +85,7 @@ def measure(
         disparity: Known disparities [H, W] float32 to use instead of matching, pixels; NaN where unknown. None to match.
         strip: Edges of the mask; None to fit them.
     """
-    strip = strip_width(mask) if strip is None else strip
+    strip = fit_strip(mask) if strip is None else strip
     if strip is None:
         return Measurement(reason="too few lines show both edges")
     confidence = strip.confidence
@@ -101,7 +101,7 @@ def measure(
     if not depths[0] <= depth <= depths[1]:
         return Measurement(line=place + corner[0], depth=depth, lean=strip.lean, reason=f"it stands {depth:.2f} m away")
     reach = _REACH * calibration.focal / depth
-    near = strip_near(strip, place, reach, mask.shape[0])
+    near = fit_strip_near(strip, place, reach, mask.shape[0])
     strip = refine_edges(near or strip, left, corner, place, reach)
     middle = 0.5 * sum(strip.edges(place))
     pixels = strip.width(place) if method == "strip" else ellipse_width(mask)
@@ -126,15 +126,24 @@ def measure(
         height=math.nan if ground is None else ground.height(middle + corner[1], place + corner[0], depth, calibration),
         lean=strip.lean,
         tilt=tilt,
-        confidence=confidence * min(matched.values.size / max(matched.tried, 1), 1.0),
-        here=near is not None or method == "ellipse",
+        confidence=confidence * min(matched.values.size / max(matched.window_count, 1), 1.0),
+        both_edges_visible=near is not None or method == "ellipse",
     )
 
 
 def _row_at_height(
     height: float, strip: Strip, corner: tuple[int, int], matched: StalkDisparity, calibration: Calibration, ground: Ground
 ) -> float:
-    """Return the row of the mask with visible edges nearest to a ``height`` in m; the reference row if heights are unknown."""
+    """Return the row of the mask with visible edges nearest to a height; the reference row if heights are unknown.
+
+    Args:
+        height: Height above the ground, m.
+        strip: Edges of the stalk's mask.
+        corner: Image row and column of the first pixel of the mask.
+        matched: Disparities of the stalk.
+        calibration: Calibration of the cameras.
+        ground: Ground in front of the cameras.
+    """
     ends = np.array([strip.first, strip.last], float)
     disparities = [matched.at(place + corner[0]) for place in ends]
     known = [disparity_here[0] for disparity_here in disparities if disparity_here is not None]
@@ -192,7 +201,13 @@ def stalk_disparity(
 
 
 def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -> float:
-    """Return the tilt of the stalk away from the camera, rad; 0 if the matched segment is too short or the tilt implausible."""
+    """Return the tilt of the stalk away from the camera, rad; 0 if the matched segment is too short or the tilt implausible.
+
+    Args:
+        matched: Disparities of the stalk.
+        disparity: Disparity at the row of the measurement, pixels.
+        calibration: Calibration of the cameras.
+    """
     if matched.lines.size < 6 or np.ptp(matched.lines) < 0.03 * calibration.focal:
         return 0.0
     first, second = index_pairs(matched.lines.size, 3)

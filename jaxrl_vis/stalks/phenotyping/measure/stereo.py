@@ -22,9 +22,9 @@ from jaxrl_vis.stalks.phenotyping.measure.width import index_pairs, median
 _MIN_SCORE = 0.5
 _AGREEING = 0.4
 _SCATTER = 1.0  # pixels: maximum scatter of the disparities of one stalk
-_FIRST = 6  # windows of a stalk that are searched over all disparities
+_COARSE_WINDOWS = 6  # windows of a stalk that are searched over all disparities
 _BESIDE = 12  # pixels: search range of the other windows around the disparity expected from the first ones
-_UNIQUE = 0.97  # maximum ratio of the second to the first peak; above, a window is ambiguous
+_MAX_PEAK_RATIO = 0.97  # maximum ratio of the second to the first peak; above, a window is ambiguous
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,13 +35,13 @@ class StalkDisparity:
         lines: [N] float64, centre row of each matched window.
         values: [N] float64, disparity of each, pixels.
         scores: [N] float64, normalised cross-correlation of each, up to 1.
-        tried: Number of windows, including unmatched ones.
+        window_count: Number of windows, including unmatched ones.
     """
 
     lines: np.ndarray
     values: np.ndarray
     scores: np.ndarray
-    tried: int
+    window_count: int
 
     def at(self, line: float) -> tuple[float, float] | None:
         """Estimate the disparity in an image row by a robust straight-line fit to the windows.
@@ -50,7 +50,7 @@ class StalkDisparity:
             Disparity and its standard error, pixels; None if there are fewer than three inliers, or fewer than 0.4 of the
             windows tried.
         """
-        minimum = max(3, math.ceil(_AGREEING * self.tried))
+        minimum = max(3, math.ceil(_AGREEING * self.window_count))
         if self.lines.size < minimum:
             return None
         offset = self.lines - line
@@ -73,7 +73,7 @@ class StalkDisparity:
         return mean, scatter / math.sqrt(count)
 
 
-def grey(image: np.ndarray) -> np.ndarray:
+def to_greyscale(image: np.ndarray) -> np.ndarray:
     """Convert an image [H, W] or [H, W, 3] of any dtype to greyscale [H, W] float32."""
     return (
         image.astype(np.float32) if image.ndim == 2 else image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
@@ -100,6 +100,10 @@ def match_rows(
         half_height: Rows of a window above and below its centre row.
         core: Central fraction of the stalk's width that a window spans: towards its edges a stalk is further away.
         spread: Tolerance for vertical misalignment of the right image, rows up or down.
+
+    Returns:
+        Disparities of the windows with a unique match, in the order of ``lines``. Windows outside the image or narrower than
+        six pixels are not matched.
     """
     wanted = [
         _Window(
@@ -111,9 +115,9 @@ def match_rows(
     ]
     wanted = [strip for strip in wanted if strip.inside(left.shape, half_height, spread)]
     # A few windows are searched over all disparities. If these agree, the others are searched near the expected disparity.
-    first = sorted(set(np.linspace(0, len(wanted) - 1, min(_FIRST, len(wanted))).round().astype(int)))
+    first = sorted(set(np.linspace(0, len(wanted) - 1, min(_COARSE_WINDOWS, len(wanted))).round().astype(int)))
     limits = int(np.floor(bounds[0])), int(np.ceil(bounds[1]))
-    matches = {place: _match(left, right, wanted[place], limits, half_height, spread) for place in first}
+    matches = {place: _match_window(left, right, wanted[place], limits, half_height, spread) for place in first}
     expected = _robust_line([(wanted[place].line, result[0]) for place, result in matches.items() if result is not None])
     for place, window in enumerate(wanted):
         if place in matches:
@@ -122,7 +126,7 @@ def match_rows(
         if expected is not None:
             middle = expected[0] + expected[1] * window.line
             within = max(math.floor(middle) - _BESIDE, limits[0]), min(math.ceil(middle) + _BESIDE, limits[1])
-        matches[place] = _match(left, right, window, within, half_height, spread) if within[0] < within[1] else None
+        matches[place] = _match_window(left, right, window, within, half_height, spread) if within[0] < within[1] else None
     values = [(float(wanted[place].line), *result) for place, result in sorted(matches.items()) if result is not None]
     matched = np.array(values, float).reshape(-1, 3)
     return StalkDisparity(matched[:, 0], matched[:, 1], matched[:, 2], len(lines))
@@ -137,23 +141,37 @@ class _Window:
     last: int
 
     def inside(self, shape: tuple[int, ...], half_height: int, spread: int) -> bool:
-        """Return whether the window is wide enough and, with the margin for vertical misalignment, inside the image."""
+        """Return True if the window is at least 6 pixels wide and, with the margin for vertical misalignment, in the image.
+
+        Args:
+            shape: Height and width of the image.
+            half_height: Rows of the window above and below its centre.
+            spread: Maximum vertical misalignment, rows.
+        """
         reach = half_height + spread
         tall = reach <= self.line and self.line + reach + 1 <= shape[0]
         return tall and self.last - self.first >= 6 and self.first >= 0 and self.last <= shape[1]
 
 
-def _match(
+def _match_window(
     left: np.ndarray, right: np.ndarray, window: _Window, bounds: tuple[int, int], half_height: int, spread: int
 ) -> tuple[float, float] | None:
-    """Return the disparity and correlation of a window; None if there is no match within the bounds, or an ambiguous one."""
+    """Return the disparity (pixels) and correlation of a window; None without a match in the bounds, or if it is ambiguous.
+
+    Args:
+        left, right: Rectified greyscale images [H, W], uint8 or float32.
+        window: Window of the left image.
+        bounds: Minimum and maximum disparity, pixels.
+        half_height: Rows of the window above and below its centre.
+        spread: Maximum vertical misalignment, rows.
+    """
     top, bottom = window.line - half_height, window.line + half_height + 1
     begin, end = max(window.first - bounds[1] - 1, 0), min(window.last - bounds[0] + 1, right.shape[1])
     if end - begin < window.last - window.first + 2:
         return None
     piece = np.ascontiguousarray(left[top:bottom, window.first : window.last])
     searched = np.ascontiguousarray(right[top - spread : bottom + spread, begin:end])
-    best = _peak(cv2.matchTemplate(searched, piece, cv2.TM_CCOEFF_NORMED))
+    best = _subpixel_peak(cv2.matchTemplate(searched, piece, cv2.TM_CCOEFF_NORMED))
     return None if best is None else (window.first - (begin + best[0]), best[1])
 
 
@@ -179,7 +197,9 @@ def sample_rows(
     bounds: tuple[float, float],
     core: float = 0.7,
 ) -> StalkDisparity:
-    """Sample the disparities of a stalk with known edges from a disparity image.
+    """Sample the disparities of a stalk with known edges from a disparity image: the median across the stalk in each row.
+
+    Rows in which less than half of the used width has a disparity within the bounds are left out.
 
     Args:
         disparity: [H, W] float32, pixels; NaN where unknown.
@@ -202,7 +222,7 @@ def sample_rows(
     return StalkDisparity(columns[:, 0], columns[:, 1], np.ones(len(columns)), len(lines))
 
 
-def _peak(score: np.ndarray) -> tuple[float, float] | None:
+def _subpixel_peak(score: np.ndarray) -> tuple[float, float] | None:
     """Return the subpixel column and the height of the unique peak of a correlation; None if there is none."""
     row, column = divmod(int(score.argmax()), score.shape[1])
     height = float(score[row, column])
@@ -210,7 +230,7 @@ def _peak(score: np.ndarray) -> tuple[float, float] | None:
         return None
     best = score.max(axis=0)
     elsewhere = max(best[: max(column - 4, 0)].max(initial=-1.0), best[column + 5 :].max(initial=-1.0))
-    if elsewhere > _UNIQUE * height:
+    if elsewhere > _MAX_PEAK_RATIO * height:
         return None
     before, after = float(score[row, column - 1]), float(score[row, column + 1])
     bend = before - 2.0 * height + after

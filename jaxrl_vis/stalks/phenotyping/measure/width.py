@@ -1,7 +1,7 @@
-"""Width of a stalk's mask in pixels, perpendicular to its axis: by its two edges (`strip_width`) or by ellipses (thesis).
+"""Width of a stalk's mask in pixels, perpendicular to its axis: by its two edges (`fit_strip`) or by ellipses (thesis).
 
-    mask -> left and right edge in each row, with subpixel precision        `line_edges`
-         -> robust straight line fit to each edge                           `strip_width`, locally `strip_near`
+    mask -> left and right edge in each row, with subpixel precision        `row_edges`
+         -> robust straight line fit to each edge                           `fit_strip`, locally `fit_strip_near`
          -> distance of the edges perpendicular to the axis, at any row     `Strip.width`
 
 An ellipse is a poor model of a strip: its minor axis deviates from the width by -19 to +16 %, depending on the fit, see
@@ -21,8 +21,8 @@ ELLIPSE_FITS: tuple[EllipseFit, ...] = ("pixels", "pixels_direct", "contour", "c
 """Methods of fitting an ellipse to a blob. ``pixels``, least squares over all its pixels, is the method of the thesis."""
 
 _MIN_LINES = 8
-_SETTLED = 1e-3  # change of weights below which the robust fit has converged
-_SWELLING = 0.12  # of the width: maximum distance of a local edge from the edge fitted to the whole stalk
+_CONVERGED = 1e-3  # change of weights below which the robust fit has converged
+_MAX_EDGE_OFFSET = 0.12  # of the width: maximum distance of a local edge from the edge fitted to the whole stalk
 _OUTLIER_DISTANCE = 1.5  # pixels: maximum distance of an edge from the mode of its neighbours
 _NOISE = (
     0.35  # pixels: standard deviation of the edge of a perfect mask about its line (0.29, the rounding error, plus a margin)
@@ -76,7 +76,7 @@ class Strip:
         return self.used * enough / (1.0 + (self.residual / 1.5) ** 2)
 
 
-def line_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def row_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the left and right edge of the longest run in each row of a mask.
 
     Args:
@@ -111,7 +111,7 @@ def line_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np
     return line, start - crossing(start - 1, start), end - 1 + crossing(end, end - 1)
 
 
-def strip_width(mask: np.ndarray, threshold: float = 0.5) -> Strip | None:
+def fit_strip(mask: np.ndarray, threshold: float = 0.5) -> Strip | None:
     """Fit two straight lines to the edges of a stalk's mask.
 
     Rows in which the stalk is partially occluded, swollen by a node, or cut off by the end of the strip are rejected as
@@ -125,10 +125,10 @@ def strip_width(mask: np.ndarray, threshold: float = 0.5) -> Strip | None:
     Returns:
         Fitted strip; None if there are fewer than eight inlier rows.
     """
-    return fit_edges(*line_edges(mask, threshold))
+    return fit_edges(*row_edges(mask, threshold))
 
 
-def strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | None:
+def fit_strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | None:
     """Fit the edges of a stalk locally around a row, so that sheaths elsewhere have no effect.
 
     Slopes are those of the whole strip, which are determined by many more rows.
@@ -150,7 +150,7 @@ def strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | N
     place, left, right = (array[begin:end] for array in strip.points)
     offset = place - strip.reference
     residuals = [edge - fit[0] - fit[1] * offset for edge, fit in zip((left, right), (strip.left, strip.right))]
-    tolerance = max(3.0, _SWELLING * strip.width(line))
+    tolerance = max(3.0, _MAX_EDGE_OFFSET * strip.width(line))
     good = np.logical_and(*(np.abs(offsets) < tolerance for offsets in residuals))
     for offsets in residuals:
         good &= np.abs(offsets - _mode(offsets[good])) < _OUTLIER_DISTANCE if good.any() else False
@@ -212,12 +212,12 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
             heavy = weight > 0
             if np.count_nonzero(heavy) < _MIN_LINES:
                 return None
-            fitted = _line(offset, edge, weight)
+            fitted = _fit_line(offset, edge, weight)
             residual = edge - fitted[0] - fitted[1] * offset
             spread = 1.4826 * median(np.abs(residual[heavy]))
             reach = 4.7 * max(spread, _NOISE / 2)
             before, weight = weight, np.maximum(1.0 - (residual / reach) ** 2, 0.0) ** 2
-            if np.abs(weight - before).max() < _SETTLED:
+            if np.abs(weight - before).max() < _CONVERGED:
                 break
         good &= weight > 0
         lines.append(fitted)
@@ -225,7 +225,7 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
     if good.sum() < _MIN_LINES:
         return None
     # Use the same rows for both edges, so that an occlusion of one edge tilts neither.
-    fits = [_line(offset, edge, good.astype(float)) for edge in (left, right)]
+    fits = [_fit_line(offset, edge, good.astype(float)) for edge in (left, right)]
     residuals = np.concatenate([edge - fit[0] - fit[1] * offset for edge, fit in zip((left, right), fits)])[np.tile(good, 2)]
     rms = float(np.sqrt(np.mean(residuals**2)))
     return Strip(
@@ -242,7 +242,12 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
 
 
 def _common_slope(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> float:
-    """Estimate the common slope of both edges, columns per row: the mode over pairs of edge points."""
+    """Estimate the common slope of both edges, columns per row: the mode over pairs of edge points.
+
+    Args:
+        line: Rows [N], in ascending order.
+        left, right: Columns [N] of the edges in these rows, pixels.
+    """
     step = max(line.size // 60, 1)
     places = np.arange(0, line.size, step)
     first, second = index_pairs(places.size, max(places.size // 4, 1))
@@ -253,9 +258,9 @@ def _common_slope(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> floa
 
 
 @functools.lru_cache(maxsize=512)
-def index_pairs(count: int, apart: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Return all pairs of indices below ``count`` that differ by at least ``apart``, as arrays of the lower and upper ones."""
-    return np.triu_indices(count, k=apart)
+def index_pairs(count: int, min_difference: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Return all pairs of indices below ``count`` that differ by ``min_difference`` or more: lower and upper ones, [P] each."""
+    return np.triu_indices(count, k=min_difference)
 
 
 def median(values: np.ndarray) -> float:
@@ -273,8 +278,8 @@ def _mode(values: np.ndarray, width: float = 1.0) -> float:
     return median(ordered[best : upper[best]])
 
 
-def _line(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """Return the offset and slope of the weighted least-squares line."""
+def _fit_line(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+    """Fit y = offset + slope * x to points [N] by least squares with weights [N]; the slope is 0 if all x are equal."""
     total = weight.sum()
     mean_x, mean_y = (weight * x).sum() / total, (weight * y).sum() / total
     spread = (weight * (x - mean_x) ** 2).sum()
@@ -290,8 +295,8 @@ def ellipse_width(mask: np.ndarray, fit: EllipseFit = "pixels") -> float | None:
         fit: Method of fitting an ellipse; see `ELLIPSE_FITS`.
 
     Returns:
-        Width in pixels; None if no blob has a valid ellipse. Ellipses wider than a blob of that area and length can be, as
-        OpenCV returns for some nearly collinear points, are rejected.
+        Width in pixels; None if no blob of 20 pixels or more has a valid ellipse. Ellipses wider than a blob of that area and
+        length can be, as OpenCV returns for some nearly collinear points, are rejected.
     """
     inside = (np.asarray(mask, np.float32) >= 0.5).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=8)

@@ -62,7 +62,7 @@ _ABOUT = ("flag", "method", "version")
 _METHOD = "stereo images of a robot that drives along the row; stalks found and outlined by networks (jaxrl-vis phenotype)"
 
 
-def with_terms(terms: Sequence[str]) -> tuple[Trait, ...]:
+def replace_terms(terms: Sequence[str]) -> tuple[Trait, ...]:
     """Return the traits, with some ontology terms replaced.
 
     Args:
@@ -92,7 +92,7 @@ def write_exchange(
         rows: Rows of plots.csv.
         columns: Columns of the field plan, in order. Those named like a column of plots.csv get the prefix ``field_``.
         plan: Field plan; plots may be missing.
-        traits: The traits, see `with_terms`.
+        traits: The traits, see `replace_terms`.
 
     Returns:
         Name of the file or folder written, relative to ``out``.

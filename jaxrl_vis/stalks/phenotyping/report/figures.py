@@ -48,6 +48,9 @@ def draw_counts(data: dict[str, Any], out: Path) -> None:
     Args:
         data: Result of `read_evaluation`.
         out: File of the figure.
+
+    Raises:
+        OSError: A file cannot be written.
     """
     import matplotlib.pyplot as plt
 
@@ -85,6 +88,7 @@ def draw_widths(data: dict[str, Any], out: Path) -> None:
 
     Raises:
         RequestError: No width was measured.
+        OSError: A file cannot be written.
     """
     import matplotlib.pyplot as plt
 
@@ -129,6 +133,7 @@ def write_times(data: dict[str, Any], out: Path) -> None:
 
     Raises:
         RequestError: The evaluation holds no times.
+        OSError: A file cannot be written.
     """
     known = [plot for plot in data["each"] if plot.get("seconds_per_pair")]
     if not known:

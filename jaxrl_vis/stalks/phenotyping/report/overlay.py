@@ -34,8 +34,8 @@ def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str 
     canvas = np.round(255.0 * (small / 255.0) ** 0.7).astype(np.uint8)
     thickness = max(round(size[0] / 800), 1)
     for sighting, label in zip(sightings, labels):
-        _outline(canvas, sighting, COUNTED if label is not None else REJECTED, scale, thickness)
-    writer = _Writer(canvas, max(size[0] / 2200, 0.3), thickness)
+        _draw_outline(canvas, sighting, COUNTED if label is not None else REJECTED, scale, thickness)
+    writer = _LabelWriter(canvas, max(size[0] / 2200, 0.3), thickness)
     writer.legend(readable(title))  # OpenCV does not survive a lone surrogate
     for sighting, label in sorted(zip(sightings, labels), key=lambda pair: pair[0].column):
         width = "" if sighting.diameter_mm is None else f"{sighting.diameter_mm:.1f} mm"
@@ -45,7 +45,7 @@ def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str 
     return canvas
 
 
-def _outline(canvas: np.ndarray, sighting: Sighting, colour: tuple[int, int, int], scale: float, thickness: int) -> None:
+def _draw_outline(canvas: np.ndarray, sighting: Sighting, colour: tuple[int, int, int], scale: float, thickness: int) -> None:
     """Draw the two edges of a stalk in the band, and bars where its widths were measured."""
 
     def at(column: float, line: float) -> tuple[int, int]:
@@ -71,7 +71,7 @@ def _outline(canvas: np.ndarray, sighting: Sighting, colour: tuple[int, int, int
         cv2.line(canvas, at(column - over, line - down), at(column + over, line + down), MEASURED, 2 * thickness, cv2.LINE_AA)
 
 
-class _Writer:
+class _LabelWriter:
     """Writer of non-overlapping text on an image, in place.
 
     Args:
@@ -84,14 +84,14 @@ class _Writer:
         self._canvas, self._letters, self._thick = canvas, font_scale, thickness
         self._taken: list[tuple[int, int, int, int]] = []
 
-    def above(self, place: tuple[int, int], text: str, colour: tuple[int, int, int]) -> None:
+    def above(self, point: tuple[int, int], text: str, colour: tuple[int, int, int]) -> None:
         """Write text above a point (column, row), as close as there is free space, with a line down to the point."""
         wide, tall = self._size(text)
-        left = min(max(place[0] - wide // 2, 0), max(self._canvas.shape[1] - wide, 0))
-        bottom = place[1] - tall // 2
-        while bottom > 2 * tall and any(_overlap((left, bottom - tall, left + wide, bottom), box) for box in self._taken):
+        left = min(max(point[0] - wide // 2, 0), max(self._canvas.shape[1] - wide, 0))
+        bottom = point[1] - tall // 2
+        while bottom > 2 * tall and any(_do_overlap((left, bottom - tall, left + wide, bottom), box) for box in self._taken):
             bottom -= tall // 3
-        cv2.line(self._canvas, (place[0], bottom), place, colour, 1, cv2.LINE_AA)
+        cv2.line(self._canvas, (point[0], bottom), point, colour, 1, cv2.LINE_AA)
         self._write((left, bottom), text, colour)
 
     def legend(self, title: str) -> None:
@@ -117,5 +117,5 @@ class _Writer:
         cv2.putText(self._canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, self._letters, colour, self._thick, cv2.LINE_AA)
 
 
-def _overlap(first: tuple[int, int, int, int], second: tuple[int, int, int, int]) -> bool:
+def _do_overlap(first: tuple[int, int, int, int], second: tuple[int, int, int, int]) -> bool:
     return first[0] < second[2] and second[0] < first[2] and first[1] < second[3] and second[1] < first[3]

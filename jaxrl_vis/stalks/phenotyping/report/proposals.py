@@ -10,13 +10,13 @@ import numpy as np
 import jaxrl_vis
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
-from jaxrl_vis.stalks.phenotyping.io.annotations import coco
+from jaxrl_vis.stalks.phenotyping.io.annotations import make_coco
 
 _TOLERANCE = 0.8  # pixels, maximum deviation of the simplified outline from the mask
 
 
 def outline(detection: Detection) -> list[float]:
-    """Return the outline of a detection's mask within its box as x, y, x, y, ..., where the first pixel spans from 0 to 1.
+    """Return the outline of a detection's mask within its box as x, y, x, y, ... in image pixels, the first from 0 to 1.
 
     It encloses the outermost pixels of each row, as a stalk is a single strip. If the mask has fewer than two rows there, it is
     the box.
@@ -71,7 +71,7 @@ def write_coco(path: Path, detected: Sequence[tuple[Path, tuple[int, int], list[
                     "score": round(detection.score, 3),
                 }
             )
-    document = coco(images, annotations, {"description": about, "version": jaxrl_vis.__version__})
+    document = make_coco(images, annotations, {"description": about, "version": jaxrl_vis.__version__})
     write_atomically(path, json.dumps(document) + "\n")
 
 

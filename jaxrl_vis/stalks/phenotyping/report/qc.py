@@ -28,9 +28,9 @@ from jaxrl_vis.stalks.phenotyping.report.tables import NO_GROUND
 from jaxrl_vis.stalks.phenotyping.track.follow import Track
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 
-_WHOLE = 200  # images of whole pairs on the page
+_MAX_PAIR_IMAGES = 200  # images of whole pairs on the page
 _MAX_WHOLE, _MIN_WHOLE = 8, 1  # per plot
-_THUMB = 844  # pixels, maximum width of these
+_MAX_THUMBNAIL_WIDTH = 844  # pixels, maximum width of these
 _STALK_COLUMNS = {
     "stalk": "stalk",
     "position_m": "position, m",
@@ -86,8 +86,8 @@ class PlotResult:
         tracks: Counted and rejected tracks; empty if the pairs could not be linked.
         start: Position of the first pair, the origin of the stalks' positions, m.
         image_width: Width of the images, pixels.
-        why: Reason that there is no count, beyond the flag; empty if there is a count or nothing to add.
-        strange: Description of how the images differ from those that the networks know; empty if they do not.
+        count_reason: Reason that there is no count, beyond the flag; empty if there is a count or nothing to add.
+        unfamiliar_note: Description of how the images differ from those that the networks know; empty if they do not.
     """
 
     row: dict[str, Any]
@@ -97,8 +97,8 @@ class PlotResult:
     tracks: list[Track]
     start: float
     image_width: int
-    why: str = ""
-    strange: str = ""
+    count_reason: str = ""
+    unfamiliar_note: str = ""
 
 
 class Page:
@@ -112,7 +112,7 @@ class Page:
 
     def __init__(self, about: list[str], overlays: Path, plots: int) -> None:
         self._about, self._overlays = about, overlays
-        self._whole = min(max(_WHOLE // max(plots, 1), _MIN_WHOLE), _MAX_WHOLE)
+        self._whole = min(max(_MAX_PAIR_IMAGES // max(plots, 1), _MIN_WHOLE), _MAX_WHOLE)
         self._file = tempfile.TemporaryFile("w+", encoding="utf-8")
         self._rows: list[dict[str, Any]] = []
 
@@ -134,12 +134,12 @@ class Page:
         pictures = _Pictures(self._overlays / file_name(name), plot)
         counted = [track for track in plot.tracks if track.counted]
         tables = [
-            {"picture": pictures.of(track), **{column: row[column] for column in _STALK_COLUMNS}}
+            {"picture": pictures.track_image(track), **{column: row[column] for column in _STALK_COLUMNS}}
             for track, row in zip(counted, plot.stalks)
         ]
         others = [
             {
-                "picture": pictures.of(track),
+                "picture": pictures.track_image(track),
                 "position, m": f"{track.position_m - plot.start:.3f}",
                 "depth, m": "" if math.isnan(track.depth_m) else f"{track.depth_m:.3f}",
                 "pairs": len(track.sightings),
@@ -151,21 +151,22 @@ class Page:
         finds = [{"why": why, "finds": count} for why, count in _group_reasons(reasons).most_common()]
         write = self._file.write
         write(f'<details id="{_escape(name)}"><summary>{_escape(name)}: {_escape(_headline(plot.row))}</summary>')
-        if plot.why:
-            write(f'<p class="doubt">No count: {_escape(plot.why)}.</p>')
-        if plot.strange:
-            write(f'<p class="doubt">{_escape(plot.strange[:1].upper() + plot.strange[1:])}.</p>')
+        if plot.count_reason:
+            write(f'<p class="doubt">No count: {_escape(plot.count_reason)}.</p>')
+        if plot.unfamiliar_note:
+            write(f'<p class="doubt">{_escape(plot.unfamiliar_note[:1].upper() + plot.unfamiliar_note[1:])}.</p>')
         if plot.stalks:
             write(_chart(plot, rejected))
-            write(f"<h3>Stalks</h3><p>{_ERRORS}</p>" + table({"picture": "", **_STALK_COLUMNS}, tables))
+            write(f"<h3>Stalks</h3><p>{_ERRORS}</p>" + html_table({"picture": "", **_STALK_COLUMNS}, tables))
         if others:
-            write("<h3>Rejected: not counted</h3>" + table({column: column for column in others[0]}, others))
+            write("<h3>Rejected: not counted</h3>" + html_table({column: column for column in others[0]}, others))
         if finds:
             total = sum(map(len, plot.frames))
             write(
-                f"<h3>Finds without a width, of {total} in single pairs</h3>" + table({"why": "why", "finds": "finds"}, finds)
+                f"<h3>Finds without a width, of {total} in single pairs</h3>"
+                + html_table({"why": "why", "finds": "finds"}, finds)
             )
-        write("<h3>Pairs</h3>" + "".join(pictures.whole(self._whole)) + "</details>\n")
+        write("<h3>Pairs</h3>" + "".join(pictures.pair_images(self._whole)) + "</details>\n")
 
     def write(self, path: Path, skipped: list[dict[str, Any]]) -> None:
         """Write the page atomically.
@@ -185,10 +186,10 @@ class Page:
             file.write("<h1>Stalks: what was counted and measured</h1>")
             file.write("".join(f"<p>{_escape(line)}</p>" for line in self._about))
             file.write("<h2>Plots</h2><p>Click on a column to sort by it, and on a plot to see its stalks.</p>")
-            file.write(table(_PLOT_COLUMNS, rows))
+            file.write(html_table(_PLOT_COLUMNS, rows))
             if skipped:
                 columns = {"plot": "plot", "pair": "pair", "why": "why"}
-                file.write(f"<h2>Pairs that were skipped: {len(skipped)}</h2>" + table(columns, skipped))
+                file.write(f"<h2>Pairs that were skipped: {len(skipped)}</h2>" + html_table(columns, skipped))
             file.write("<h2>Plot by plot</h2>")
             self._file.seek(0)
             shutil.copyfileobj(self._file, file)
@@ -218,7 +219,7 @@ def _group_reasons(reasons: Counter[str]) -> Counter[str]:
     return groups
 
 
-def table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
+def html_table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
     """Return a sortable HTML table.
 
     Args:
@@ -264,7 +265,7 @@ class _Pictures:
             overlay = read_image(folder / file_name(f"{plot.pairs[frame]}.png"))
             for place, sighting in tracks:
                 name = f"pair {plot.pairs[frame]}"
-                self._crops[place] = picture(self._crop(overlay, plot.frames[frame][sighting]), name, "stalk")
+                self._crops[place] = html_image(self._crop(overlay, plot.frames[frame][sighting]), name, "stalk")
 
     def _clear_section(self, frame: int, sighting: int) -> tuple[bool, float]:
         chosen = self._plot.frames[frame][sighting]
@@ -284,33 +285,39 @@ class _Pictures:
             else np.zeros((8, 8, 3), np.uint8)
         )
 
-    def of(self, track: Track) -> _Html:
-        """Return the image of a track's best sighting."""
+    def track_image(self, track: Track) -> _Html:
+        """Return the image of a track's best sighting: one with a width, if any, and with maximum confidence."""
         return self._crops[next(index for index, other in enumerate(self._plot.tracks) if other is track)]
 
-    def whole(self, count: int) -> Iterable[str]:
-        """Yield images of at most ``count`` whole pairs, spread evenly over the plot."""
+    def pair_images(self, count: int) -> Iterable[str]:
+        """Yield HTML elements with the overlays of at most ``count`` whole pairs, spread evenly over the plot.
+
+        Raises:
+            OSError: An overlay cannot be read.
+        """
         pairs = self._plot.pairs
         for place in np.unique(np.linspace(0, len(pairs) - 1, min(count, len(pairs))).round()).astype(int):
             overlay = read_image(self._folder / file_name(f"{pairs[place]}.png"))
-            shrink = min(_THUMB / overlay.shape[1], 1.0)
+            shrink = min(_MAX_THUMBNAIL_WIDTH / overlay.shape[1], 1.0)
             small = cv2.resize(overlay, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
             name = f"pair {pairs[place]}"
-            yield f"<figure>{picture(small, name, 'pair')}<figcaption>{_escape(name)}</figcaption></figure>"
+            yield f"<figure>{html_image(small, name, 'pair')}<figcaption>{_escape(name)}</figcaption></figure>"
 
 
-def picture(image: np.ndarray, name: str, kind: str) -> _Html:
+def html_image(image: np.ndarray, name: str, css_class: str) -> _Html:
     """Return an HTML element with an image (RGB [H, W, 3] uint8) embedded as JPEG.
 
     Args:
         image: The image.
         name: Alternative text and tooltip.
-        kind: CSS class, ``stalk`` or ``pair``.
+        css_class: CSS class, ``stalk`` or ``pair``.
     """
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 75])
     source = base64.b64encode(data.tobytes()).decode()
     title = _escape(name)
-    return _Html(f'<img class="{kind}" loading="lazy" alt="{title}" title="{title}" src="data:image/jpeg;base64,{source}">')
+    return _Html(
+        f'<img class="{css_class}" loading="lazy" alt="{title}" title="{title}" src="data:image/jpeg;base64,{source}">'
+    )
 
 
 def _chart(plot: PlotResult, rejected: list[Track]) -> str:

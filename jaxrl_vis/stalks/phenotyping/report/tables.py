@@ -9,8 +9,7 @@ import numpy as np
 
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.spreadsheets import to_csv
-from jaxrl_vis.stalks.phenotyping.track.follow import Path as Driven
-from jaxrl_vis.stalks.phenotyping.track.follow import Track
+from jaxrl_vis.stalks.phenotyping.track.follow import RobotPath, Track
 from jaxrl_vis.stalks.phenotyping.track.heights import StalkWidths, stalk_widths
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 
@@ -79,7 +78,7 @@ class Origin:
 
 
 def plot_rows(
-    frames: list[list[Sighting]], tracks: list[Track], path: Driven, skipped: int, origin: Origin
+    frames: list[list[Sighting]], tracks: list[Track], path: RobotPath, skipped: int, origin: Origin
 ) -> tuple[list[Row], Row]:
     """Compute the rows of the counted stalks of one plot, in the order of ``tracks``, and the plot's own row.
 
@@ -101,18 +100,18 @@ def plot_rows(
             {
                 "plot": origin.plot,
                 "stalk": len(stalks) + 1,
-                "position_m": _text(track.position_m - path.places[0], 4),
-                "depth_m": _text(track.depth_m, 4),
-                "width_mm": "" if lower is None else _text(lower.mm, 3),
-                "width_se_mm": "" if lower is None else _text(lower.error, 3),
+                "position_m": _format_number(track.position_m - path.positions[0], 4),
+                "depth_m": _format_number(track.depth_m, 4),
+                "width_mm": "" if lower is None else _format_number(lower.mm, 3),
+                "width_se_mm": "" if lower is None else _format_number(lower.error, 3),
                 "height_in": 12 if widths.height_known else "",
-                "width_24in_mm": "" if upper is None else _text(upper.mm, 3),
-                "width_24in_se_mm": "" if upper is None else _text(upper.error, 3),
-                "taper_mm_per_in": "" if widths.taper is None else _text(widths.taper, 3),
-                "lean_deg": _text(float(np.median(leans)), 1) if leans else "",
+                "width_24in_mm": "" if upper is None else _format_number(upper.mm, 3),
+                "width_24in_se_mm": "" if upper is None else _format_number(upper.error, 3),
+                "taper_mm_per_in": "" if widths.taper is None else _format_number(widths.taper, 3),
+                "lean_deg": _format_number(float(np.median(leans)), 1) if leans else "",
                 "frames": len(sightings),
                 "frames_measured": 0 if lower is None else lower.count,
-                "confidence": _text(confidence, 3),
+                "confidence": _format_number(confidence, 3),
                 "flag": _flag(widths, confidence),
                 "method": origin.method,
                 "version": origin.version,
@@ -134,10 +133,10 @@ def _flag(widths: StalkWidths, confidence: float) -> str:
     return "corrected for taper" if widths.lower.corrected else "ok"
 
 
-def _plot_row(stalks: list[Row], pairs: int, path: Driven, skipped: int, origin: Origin) -> Row:
+def _plot_row(stalks: list[Row], pairs: int, path: RobotPath, skipped: int, origin: Origin) -> Row:
     widths = np.array([float(row["width_mm"]) for row in stalks if row["width_mm"] != ""])
     # In unfamiliar images the networks detect nothing, so no detections do not mean a count of 0.
-    count = len(stalks) if path.seen >= _MIN_SEEN and stalks else ""
+    count = len(stalks) if path.seen_fraction >= _MIN_SEEN and stalks else ""
     doubts = [PARTLY_SEEN] if stalks and count == "" else []
     doubts += [NO_WIDTHS] if stalks and not widths.size else []
     doubts += [SKIPPED] if stalks and skipped else []
@@ -147,11 +146,11 @@ def _plot_row(stalks: list[Row], pairs: int, path: Driven, skipped: int, origin:
         "plot": origin.plot,
         "pairs": pairs,
         "pairs_skipped": skipped,
-        "length_m": _text(path.length, 4),
+        "length_m": _format_number(path.length, 4),
         "stalks": count,
-        "stalks_per_m": _text(count / path.length, 3) if count != "" and path.length > 0 else "",
-        **_widths(widths),
-        **_higher(stalks),
+        "stalks_per_m": _format_number(count / path.length, 3) if count != "" and path.length > 0 else "",
+        **_width_columns(widths),
+        **_upper_columns(stalks),
         "flag": flag,
         "method": origin.method,
         "version": origin.version,
@@ -179,7 +178,7 @@ def rows_without_path(
         "length_m": "",
         "stalks": "",
         "stalks_per_m": "",
-        **_widths(np.array(measured)),
+        **_width_columns(np.array(measured)),
         "flag": reason,
         "method": origin.method,
         "version": origin.version,
@@ -188,24 +187,24 @@ def rows_without_path(
     return [], {**row, "width_se_mm": "", "width_24in_mean_mm": "", "taper_mean_mm_per_in": "", "stalks_measured": ""}
 
 
-def _higher(stalks: list[Row]) -> Row:
+def _upper_columns(stalks: list[Row]) -> Row:
     """Return mean width and taper over the stalks that were also measured at 24 inches."""
     means = {"width_24in_mean_mm": "width_24in_mm", "taper_mean_mm_per_in": "taper_mm_per_in"}
     values = {name: [float(row[column]) for row in stalks if row[column] != ""] for name, column in means.items()}
-    return {name: _text(float(np.mean(numbers)), 3) if numbers else "" for name, numbers in values.items()}
+    return {name: _format_number(float(np.mean(numbers)), 3) if numbers else "" for name, numbers in values.items()}
 
 
-def _widths(widths: np.ndarray) -> Row:
+def _width_columns(widths: np.ndarray) -> Row:
     spread = float(widths.std(ddof=1)) if widths.size > 1 else math.nan
     return {
-        "width_mean_mm": _text(float(widths.mean()), 3) if widths.size else "",
-        "width_sd_mm": _text(spread, 3),
-        "width_se_mm": _text(spread / math.sqrt(widths.size), 3) if widths.size else "",
+        "width_mean_mm": _format_number(float(widths.mean()), 3) if widths.size else "",
+        "width_sd_mm": _format_number(spread, 3),
+        "width_se_mm": _format_number(spread / math.sqrt(widths.size), 3) if widths.size else "",
         "stalks_measured": widths.size,
     }
 
 
-def _text(value: float, digits: int) -> str:
+def _format_number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else ""
 
 

@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.track.follow import Path, Track, follow
+from jaxrl_vis.stalks.phenotyping.track.follow import RobotPath, Track, track_stalks
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 from jaxrl_vis_envs.plants import Calibration
 
@@ -22,63 +22,63 @@ _LINK_RATIO = 1.2  # minimum ratio of links in reverse to forward, if the forwar
 
 
 @dataclasses.dataclass(frozen=True)
-class Followed:
+class TrackedPlot:
     """Tracks of a plot, and the robot's path.
 
     Attributes:
         tracks: Tracks of stalks, including those that are not counted.
-        path: Path of the robot; places increase with the odometry, even if the cameras moved to their own left.
-        fits: True if the images are consistent with the odometry. If False, stalks cannot be counted.
+        path: Path of the robot; positions increase with the odometry, even if the cameras moved to their own left.
+        is_consistent: True if the images are consistent with the odometry. If False, stalks cannot be counted.
     """
 
     tracks: list[Track]
-    path: Path
-    fits: bool
+    path: RobotPath
+    is_consistent: bool
 
 
-def follow_either_way(
+def track_either_way(
     frames: list[list[Sighting]],
     distances: np.ndarray,
     calibration: Calibration,
     columns: tuple[float, float] | None = None,
-) -> Followed:
+) -> TrackedPlot:
     """Track the stalks of a plot in whichever direction the cameras moved.
 
-    If the images are consistent with a motion to the cameras' right, the result is that of `follow.follow`.
+    If the images are consistent with a motion to the cameras' right, the result is that of `follow.track_stalks`.
 
     Args:
         frames: Sightings of each pair, in driving order.
         distances: Distance driven [F] float64 by odometry, m.
         calibration: Calibration of the cameras.
-        columns: Range of visible image columns; see `follow.follow`.
+        columns: Range of visible image columns; see `follow.track_stalks`.
     """
-    tracks, path = follow(frames, distances, calibration, columns=columns)
-    fits = not _is_contradicted(frames, path.places)
-    back, backwards = follow(frames, -np.asarray(distances, float), calibration, columns=columns)
+    tracks, path = track_stalks(frames, distances, calibration, columns=columns)
+    fits = not _is_contradicted(frames, path.positions)
+    back, backwards = track_stalks(frames, -np.asarray(distances, float), calibration, columns=columns)
     # If pairs differ too much to contradict either direction, take the one in which more sightings are linked.
-    better = _links(back) > (_LINK_RATIO if fits else 1.0) * _links(tracks)
-    well = _links(back) > _MIN_LINKED * sum(map(len, frames))
-    if better and well and not _is_contradicted(frames, backwards.places):
+    better = _count_links(back) > (_LINK_RATIO if fits else 1.0) * _count_links(tracks)
+    well = _count_links(back) > _MIN_LINKED * sum(map(len, frames))
+    if better and well and not _is_contradicted(frames, backwards.positions):
         tracks = [dataclasses.replace(track, position_m=-track.position_m) for track in back]
-        return Followed(tracks, dataclasses.replace(backwards, places=-backwards.places), True)
-    return Followed(tracks, path, fits)
+        return TrackedPlot(tracks, dataclasses.replace(backwards, positions=-backwards.positions), True)
+    return TrackedPlot(tracks, path, fits)
 
 
-def _links(tracks: list[Track]) -> int:
+def _count_links(tracks: list[Track]) -> int:
     """Count the sightings that continue a track from an earlier pair."""
     return sum(len(track.sightings) - 1 for track in tracks)
 
 
-def _is_contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
+def _is_contradicted(frames: list[list[Sighting]], positions: np.ndarray) -> bool:
     """Return whether most pairs that share stalks with the previous one contradict the path.
 
     Args:
         frames: Sightings of each pair.
-        places: Position [F] float64 of each pair along the row, m.
+        positions: Position [F] float64 of each pair along the row, m.
     """
     compared = judged = against = 0
-    for first, second, step in zip(frames, frames[1:], np.diff(places)):
-        best, own, possible = _count_shared(_places(first), _places(second), float(step))
+    for first, second, step in zip(frames, frames[1:], np.diff(positions)):
+        best, own, possible = _count_shared(_row_positions(first), _row_positions(second), float(step))
         compared += possible >= _MIN_SHARED
         if best >= max(_MIN_SHARED, _MIN_SHARED_FRACTION * possible):
             judged += 1
@@ -86,7 +86,7 @@ def _is_contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
     return against > max(judged / 2, _MIN_CONTRADICTIONS * compared)
 
 
-def _places(sightings: list[Sighting]) -> np.ndarray:
+def _row_positions(sightings: list[Sighting]) -> np.ndarray:
     """Return the known positions [N, 2] float64 of the stalks of a pair: along the row and depth, m."""
     known = [
         (sighting.along_m, sighting.depth_m)
@@ -100,7 +100,7 @@ def _count_shared(first: np.ndarray, second: np.ndarray, step: float) -> tuple[i
     """Count the stalks that two pairs share, by matching their positions after a step of the cameras.
 
     Args:
-        first, second: Positions [N, 2] and [M, 2] float64, see `_places`.
+        first, second: Positions [N, 2] and [M, 2] float64, see `_row_positions`.
         step: Distance that the cameras moved between the pairs by odometry, m.
 
     Returns:
@@ -118,6 +118,6 @@ def _count_shared(first: np.ndarray, second: np.ndarray, step: float) -> tuple[i
 
     candidates = moved[near]
     best = max((count(float(by)) for by in candidates), default=0)
-    # Tolerate an error of the odometry of a few per cent, which `follow` corrects where possible.
+    # Tolerate an error of the odometry of a few per cent, which `track_stalks` corrects where possible.
     own = max((count(float(by)) for by in candidates if abs(by - step) < 0.018), default=0)
     return best, own, possible

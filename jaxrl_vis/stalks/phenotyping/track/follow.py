@@ -29,10 +29,10 @@ class Gates:
         depth: Maximum difference of their depths.
         merge: Maximum distance along the row between two tracks of one stalk, which are merged.
         behind: The same for tracks of different depth, with the rays of one evaluated at the depth of the other.
-        astray: Maximum fraction of the pairs of the shorter track in which both are seen, to merge them.
+        max_shared: Maximum fraction of the pairs of the shorter track in which both are seen, to merge them.
         row: Maximum difference between the depth of a counted stalk and the median depth.
-        fraction: Minimum fraction of the pairs with the stalk in view that must show it to count it.
-        least: Minimum number of pairs that must show it, unless fewer have it in view.
+        min_fraction: Minimum fraction of the pairs with the stalk in view that must show it to count it.
+        min_pairs: Minimum number of pairs that must show it, unless fewer have it in view.
         ends: Maximum distance of a counted stalk's foot beyond the ends of the path.
     """
 
@@ -40,10 +40,10 @@ class Gates:
     depth: float = 0.05
     merge: float = 0.015
     behind: float = 0.005
-    astray: float = 0.34
+    max_shared: float = 0.34
     row: float = 0.2
-    fraction: float = 0.3
-    minimum: int = 2
+    min_fraction: float = 0.3
+    min_pairs: int = 2
     ends: float = 0.01
 
 
@@ -67,22 +67,22 @@ class Track:
 
 
 @dataclasses.dataclass(frozen=True)
-class Path:
+class RobotPath:
     """Path of the robot.
 
     Attributes:
-        places: [F] float64, position of each pair along the row, m: odometry corrected by stereo.
+        positions: [F] float64, position of each pair along the row, m: odometry corrected by stereo.
         length: Length of the row that was passed, m, including half a step at each end.
-        seen: Fraction of that length in view of any pair.
+        seen_fraction: Fraction of that length in view of any pair.
     """
 
-    places: np.ndarray
+    positions: np.ndarray
     length: float
-    seen: float = 1.0
+    seen_fraction: float = 1.0
 
 
 @dataclasses.dataclass
-class _Open:
+class _OpenTrack:
     """Track under construction; its lists have one entry per sighting."""
 
     sightings: list[tuple[int, int]] = dataclasses.field(default_factory=list)
@@ -95,22 +95,23 @@ class _Open:
         """Return the finite depths of the sightings, m."""
         return np.array(self.depth)[np.isfinite(self.depth)]
 
-    def at(self, depth: float) -> float:
+    def position_at(self, depth: float) -> float:
         """Return the position along the row, m, assuming a depth in m."""
         return float(np.median([offset + ray * depth for offset, ray in self.rays]))
 
-    def place(self) -> tuple[float, float]:
+    def locate(self) -> tuple[float, float]:
+        """Return the median position along the row and depth of the last nine sightings, m; NaN for an unknown depth."""
         depths = [depth for depth in self.depth[-9:] if math.isfinite(depth)]
         return float(np.median(self.along[-9:])), float(np.median(depths)) if depths else math.nan
 
 
-def follow(
+def track_stalks(
     frames: list[list[Sighting]],
     distances: np.ndarray,
     calibration: Calibration,
     gates: Gates = Gates(),
     columns: tuple[float, float] | None = None,
-) -> tuple[list[Track], Path]:
+) -> tuple[list[Track], RobotPath]:
     """Track the stalks of a plot.
 
     Args:
@@ -123,57 +124,61 @@ def follow(
     Returns:
         Tracks in the order in which the robot passed them, including those not counted, and the robot's path.
     """
-    tracks: list[_Open] = []
-    places = np.zeros(len(frames))
+    tracks: list[_OpenTrack] = []
+    positions = np.zeros(len(frames))
     correction = 0.0
     driven = np.asarray(distances, float) - (distances[0] if len(distances) else 0.0)
     row = [sighting.depth_m for sightings in frames for sighting in sightings if sighting.depth_m is not None]
     usual = float(np.median(row)) if row else _USUAL_DEPTH
     for frame, sightings in enumerate(frames):
         view = _PairView.of(sightings, calibration, usual)
-        places[frame] = driven[frame] + correction
-        pairs = _assign(tracks, view, places[frame], gates)
-        moves = [tracks[track].place()[0] - view.along[new] - places[frame] for track, new in pairs if view.known[new]]
+        positions[frame] = driven[frame] + correction
+        pairs = _assign(tracks, view, positions[frame], gates)
+        moves = [
+            tracks[track].locate()[0] - view.along[new] - positions[frame] for track, new in pairs if view.is_measured[new]
+        ]
         if len(moves) >= 3:
             correction += float(np.median(moves))
-            places[frame] = driven[frame] + correction
-            pairs = _assign(tracks, view, places[frame], gates)
+            positions[frame] = driven[frame] + correction
+            pairs = _assign(tracks, view, positions[frame], gates)
         taken = {new: track for track, new in pairs}
-        for new in map(int, np.flatnonzero(view.there)):
-            depth = float(view.depth[new]) if view.known[new] else math.nan
+        for new in map(int, np.flatnonzero(view.is_candidate)):
+            depth = float(view.depth[new]) if view.is_measured[new] else math.nan
             if new in taken:
                 track = tracks[taken[new]]
-                along = view.along[new] if view.known[new] else view.along_at(track.place()[1])[new]
+                along = view.along[new] if view.is_measured[new] else view.along_at(track.locate()[1])[new]
             else:
-                track, along = _Open(), view.along[new]
+                track, along = _OpenTrack(), view.along[new]
                 tracks.append(track)
             track.sightings.append((frame, new))
-            track.along.append(float(along + places[frame]))
+            track.along.append(float(along + positions[frame]))
             track.depth.append(depth)
-            track.rays.append((float(places[frame]) - view.half, float(view.rays[new])))
-            track.feet.append(float(along + places[frame] - view.over[new]))
-    step = float(np.median(np.diff(places))) if len(places) > 1 else 0.0
+            track.rays.append((float(positions[frame]) - view.half, float(view.rays[new])))
+            track.feet.append(float(along + positions[frame] - view.foot_offset[new]))
+    step = float(np.median(np.diff(positions))) if len(positions) > 1 else 0.0
     field = tuple(
         (column - 0.5 - calibration.centre[0]) / calibration.focal for column in columns or (0.0, float(calibration.width))
     )
-    length = abs(float(places[-1] - places[0]) + step) if len(places) else 0.0
-    path = Path(places, length, _seen(places, step, [ray * usual - 0.5 * calibration.baseline for ray in field]))
+    length = abs(float(positions[-1] - positions[0]) + step) if len(positions) else 0.0
+    path = RobotPath(
+        positions, length, _seen_fraction(positions, step, [ray * usual - 0.5 * calibration.baseline for ray in field])
+    )
     closed = [_finish_track(track, path, step, field, usual, gates) for track in _merge_tracks(tracks, gates)]
     return sorted(closed, key=lambda track: track.position_m * (-1.0 if step < 0 else 1.0)), path
 
 
-def _seen(places: np.ndarray, step: float, field: list[float]) -> float:
+def _seen_fraction(positions: np.ndarray, step: float, field: list[float]) -> float:
     """Return the fraction of the row beside the path that is in view of any pair.
 
     Args:
-        places: Position [F] float64 of each pair along the row, m.
+        positions: Position [F] float64 of each pair along the row, m.
         step: Distance between two pairs, m.
         field: Ends of the field of view along the row, relative to the position of the pair, m.
     """
-    if not len(places):
+    if not len(positions):
         return 0.0
-    points = np.linspace(places[0] - 0.5 * step, places[-1] + 0.5 * step, 201)
-    offsets = points[:, None] - places
+    points = np.linspace(positions[0] - 0.5 * step, positions[-1] + 0.5 * step, 201)
+    offsets = points[:, None] - positions
     return float(((offsets >= field[0]) & (offsets <= field[1])).any(axis=1).mean())
 
 
@@ -185,9 +190,9 @@ class _PairView:
         rays: Tangent of the horizontal angle at which the left camera sees the stalk.
         along: Position along the row relative to the midpoint of the cameras, m; at the usual depth if not measured.
         depth: Depth of the front surface, m; NaN if not measured.
-        known: True if position and depth were measured.
-        there: True if the sighting may be a stalk of the row.
-        over: Distance along the row from the stalk's foot to the place of its measurement, m; 0 if its height is unknown.
+        is_measured: True if position and depth were measured.
+        is_candidate: True if the sighting may be a stalk of the row.
+        foot_offset: Distance along the row from the stalk's foot to its measurement, m; 0 if its height is unknown.
         half: Half the baseline (scalar), m.
         usual: Median depth over all pairs (scalar), m.
     """
@@ -195,9 +200,9 @@ class _PairView:
     rays: np.ndarray
     along: np.ndarray
     depth: np.ndarray
-    known: np.ndarray
-    there: np.ndarray
-    over: np.ndarray
+    is_measured: np.ndarray
+    is_candidate: np.ndarray
+    foot_offset: np.ndarray
     half: float
     usual: float
 
@@ -247,34 +252,34 @@ def _are_distinct(sightings: list[Sighting]) -> np.ndarray:
     return own
 
 
-def _assign(tracks: list[_Open], view: _PairView, place: float, gates: Gates) -> list[tuple[int, int]]:
+def _assign(tracks: list[_OpenTrack], view: _PairView, position: float, gates: Gates) -> list[tuple[int, int]]:
     """Assign sightings to tracks by minimum cost; return pairs (track, sighting) of indices, each used at most once."""
     if not tracks or not view.rays.size:
         return []
-    there = np.array([track.place() for track in tracks])
+    there = np.array([track.locate() for track in tracks])
     # A sighting without depth is compared at the depth of the track.
-    along = np.where(view.known, view.along, [view.along_at(depth) for _, depth in there]) + place
+    along = np.where(view.is_measured, view.along, [view.along_at(depth) for _, depth in there]) + position
     aside = np.abs(there[:, :1] - along) / gates.along
     away = np.nan_to_num(np.abs(there[:, 1:] - view.depth[None]) / gates.depth, nan=0.4)
-    cost = np.where((aside < 1.0) & (away < 1.0) & view.there, aside + 0.5 * away, _FORBIDDEN_COST)
+    cost = np.where((aside < 1.0) & (away < 1.0) & view.is_candidate, aside + 0.5 * away, _FORBIDDEN_COST)
     rows, columns = linear_sum_assignment(cost)
     return [(int(row), int(column)) for row, column in zip(rows, columns) if cost[row, column] < _FORBIDDEN_COST]
 
 
-def _merge_tracks(tracks: list[_Open], gates: Gates) -> list[_Open]:
+def _merge_tracks(tracks: list[_OpenTrack], gates: Gates) -> list[_OpenTrack]:
     """Merge tracks of one stalk into the longer one, which is modified in place: same position, and hardly ever seen together.
 
     Tracks are also merged if they always lie on the same rays and one of the depths is wrong: of two stalks one behind the
     other, the cameras would see both as they move on.
     """
-    merged: list[_Open] = []
+    merged: list[_OpenTrack] = []
     for track in sorted(tracks, key=lambda track: -len(track.sightings)):
         for other in merged:
             aside, away = _track_distance(track, other)
             shared = {frame for frame, _ in track.sightings} & {frame for frame, _ in other.sightings}
             # A wrongly assigned sighting may make both appear in one pair.
             near = aside < gates.merge and away < gates.depth
-            if (near or _one_behind(track, other) < gates.behind) and len(shared) <= gates.astray * len(track.sightings):
+            if (near or _one_behind(track, other) < gates.behind) and len(shared) <= gates.max_shared * len(track.sightings):
                 other.sightings += track.sightings
                 other.along += track.along
                 other.depth += track.depth
@@ -286,7 +291,7 @@ def _merge_tracks(tracks: list[_Open], gates: Gates) -> list[_Open]:
     return merged
 
 
-def _one_behind(track: _Open, other: _Open) -> float:
+def _one_behind(track: _OpenTrack, other: _OpenTrack) -> float:
     """Return the distance along the row, m, between two tracks if ``track`` is placed at the depth of ``other``."""
     depths = other.depths()
     if len(track.sightings) < 2 or not len(depths):
@@ -296,28 +301,30 @@ def _one_behind(track: _Open, other: _Open) -> float:
     return float(np.median(np.abs(positions)))
 
 
-def _track_distance(track: _Open, other: _Open) -> tuple[float, float]:
-    """Return the distances of two tracks along the row and in depth, m."""
+def _track_distance(track: _OpenTrack, other: _OpenTrack) -> tuple[float, float]:
+    """Return the distances of two tracks along the row and in depth, m; if only one has a depth, it is assumed for both."""
     depths = track.depths(), other.depths()
     if all(map(len, depths)) or not any(map(len, depths)):
         aside = abs(float(np.median(track.along) - np.median(other.along)))
         return aside, abs(float(np.median(depths[0]) - np.median(depths[1]))) if len(depths[0]) else 0.0
     # One has no depth: assume that of the other.
     depth = float(np.median(np.concatenate(depths)))
-    return abs(track.at(depth) - other.at(depth)), 0.0
+    return abs(track.position_at(depth) - other.position_at(depth)), 0.0
 
 
-def _finish_track(track: _Open, path: Path, step: float, field: tuple[float, ...], usual: float, gates: Gates) -> Track:
+def _finish_track(
+    track: _OpenTrack, path: RobotPath, step: float, field: tuple[float, ...], usual: float, gates: Gates
+) -> Track:
     position = float(np.median(track.along))
     depths = track.depths()
     depth = float(np.median(depths)) if depths.size else math.nan
     # Expected number of sightings: pairs with the stalk well inside the field of view.
     middle, half = (0.5 * (field[1] + sign * field[0]) * (depth if math.isfinite(depth) else usual) for sign in (1.0, -1.0))
-    expected = int((np.abs(path.places + middle - position) < 0.9 * half).sum())
+    expected = int((np.abs(path.positions + middle - position) < 0.9 * half).sum())
     known = math.isfinite(depth)
     # A stalk without a measured depth must be seen twice as often.
-    wanted = max(min(gates.minimum, expected), math.ceil((1.0 if known else 2.0) * gates.fraction * expected), 1)
-    begin, end = sorted((path.places[0] - 0.5 * step, path.places[-1] + 0.5 * step))
+    wanted = max(min(gates.min_pairs, expected), math.ceil((1.0 if known else 2.0) * gates.min_fraction * expected), 1)
+    begin, end = sorted((path.positions[0] - 0.5 * step, path.positions[-1] + 0.5 * step))
     if len(track.sightings) < wanted:
         reason = f"seen in {len(track.sightings)} of {expected} pairs"
     elif known and abs(depth - usual) > gates.row:

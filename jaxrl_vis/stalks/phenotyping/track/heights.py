@@ -20,10 +20,10 @@ USUAL_TAPER = 0.405
 _TAPER_SPREAD = 0.3  # relative standard deviation of the taper of stalks within a plot
 _MIN_SIGHTINGS = 5
 _MIN_CLEAR = 3  # number of sightings without an occluded edge from which the others are ignored
-_LOWER_BOUNDS = 0.85
+_OCCLUDED_QUANTILE = 0.85
 # Errors common to all pairs, which their scatter does not show; estimated on synthetic stalks.
 _MASK_ERROR = 0.7  # pixels: bias of masks on one texture
-_HIDING_ERROR = 0.8  # mm, if an edge may be occluded in all pairs
+_OCCLUSION_ERROR = 0.8  # mm, if an edge may be occluded in all pairs
 _CALIBRATION_ERROR = 0.005  # relative: focal length and baseline of a good calibration
 _FEW = 2.0  # pairs: correction for the underestimated scatter of few pairs
 _MAX_OFFSET = 4.0 * INCH  # m: maximum distance of a measurement from a height
@@ -69,7 +69,12 @@ class StalkWidths:
 
 
 def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWidths]:
-    """Estimate the widths of the stalks of a plot, in the order of their tracks."""
+    """Estimate the widths of the stalks of a plot, in the order of their tracks.
+
+    Args:
+        frames: Sightings of each pair.
+        tracks: Tracks of the stalks, whose indices refer to ``frames``.
+    """
     of_stalks = [[frames[frame][place] for frame, place in track.sightings] for track in tracks]
     first = [_widths_of_stalk(sightings, USUAL_TAPER) for sightings in of_stalks]
     tapers = [width.taper for width in first if width.taper is not None]
@@ -78,7 +83,7 @@ def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[Stal
 
 
 @dataclasses.dataclass(frozen=True)
-class _Value:
+class _WidthMeasurement:
     """Diameter measured in one pair.
 
     Attributes:
@@ -99,20 +104,25 @@ class _Value:
 
 def _widths_of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
     known = [
-        _Value(
-            e.diameter_mm, e.deviation_mm, e.height_m, e.confidence * _facing(e), e.occluded, _pixel(e.diameter_mm, e.width_px)
+        _WidthMeasurement(
+            e.diameter_mm,
+            e.deviation_mm,
+            e.height_m,
+            e.confidence * _view_weight(e),
+            e.occluded,
+            _pixel_size(e.diameter_mm, e.width_px),
         )
         for e in sightings
         if e.diameter_mm is not None and e.height_m is not None
     ]
     above = [
-        _Value(
+        _WidthMeasurement(
             e.upper_mm,
             e.upper_deviation_mm,
             e.upper_height_m,
-            e.upper_confidence * _facing(e),
+            e.upper_confidence * _view_weight(e),
             e.upper_occluded,
-            _pixel(e.upper_mm, None if e.upper_place is None else e.upper_place[2]),
+            _pixel_size(e.upper_mm, None if e.upper_place is None else e.upper_place[2]),
         )
         for e in sightings
         if e.upper_mm is not None and e.upper_height_m is not None
@@ -124,18 +134,18 @@ def _widths_of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
     return StalkWidths(lower, upper, own, True)
 
 
-def _pixel(mm: float, pixels: float | None) -> float:
+def _pixel_size(mm: float, pixels: float | None) -> float:
     """Return the size of a pixel, mm, at a stalk of this width in mm and pixels; 0 if unknown."""
     return mm / pixels if pixels else 0.0
 
 
-def _facing(sighting: Sighting) -> float:
+def _view_weight(sighting: Sighting) -> float:
     """Return the weight of a sighting by its viewing angle, 0 to 1; 1 if the angle is unknown."""
     return 1.0 if sighting.ray_deg is None else math.exp(-((sighting.ray_deg / _ASIDE) ** 2))
 
 
-def _width_at(height: float, values: list[_Value], taper: float) -> Width | None:
-    """Estimate the width at a height in m; None if nothing was measured near it."""
+def _width_at(height: float, values: list[_WidthMeasurement], taper: float) -> Width | None:
+    """Estimate the width at a height in m, corrected by the ``taper`` in mm per inch; None if nothing was measured near it."""
     near, far = [], 0
     for value in values:
         inches = (value.height - height) / INCH
@@ -144,29 +154,36 @@ def _width_at(height: float, values: list[_Value], taper: float) -> Width | None
         error = math.hypot(value.deviation or 0.0, _TAPER_SPREAD * taper * inches)
         near.append(dataclasses.replace(value, mm=value.mm + taper * inches, deviation=error))
         far += abs(value.height - height) > _NEAR_HEIGHT
-    width = _robust(near)
+    width = _combine(near)
     return None if width is None else dataclasses.replace(width, corrected=2 * far > len(near))
 
 
 def robust_width(sightings: list[Sighting]) -> Width | None:
     """Estimate the diameter of a stalk from sightings at any height; None if it was never measured."""
-    return _robust(
+    return _combine(
         [
-            _Value(e.diameter_mm, e.deviation_mm, 0.0, e.confidence * _facing(e), e.occluded, _pixel(e.diameter_mm, e.width_px))
+            _WidthMeasurement(
+                e.diameter_mm,
+                e.deviation_mm,
+                0.0,
+                e.confidence * _view_weight(e),
+                e.occluded,
+                _pixel_size(e.diameter_mm, e.width_px),
+            )
             for e in sightings
             if e.diameter_mm is not None
         ]
     )
 
 
-def _robust(values: list[_Value]) -> Width | None:
+def _combine(values: list[_WidthMeasurement]) -> Width | None:
     """Estimate a width as the weighted median of the measurements with both edges visible; None if there are none at all.
 
     If there are too few of these, all measurements are used, and the 0.85 quantile instead of the median, as measurements with
     an occluded edge are lower bounds.
     """
     clear = [value for value in values if not value.occluded]
-    used, quantile = (clear, 0.5) if len(clear) >= _MIN_CLEAR or len(clear) == len(values) else (values, _LOWER_BOUNDS)
+    used, quantile = (clear, 0.5) if len(clear) >= _MIN_CLEAR or len(clear) == len(values) else (values, _OCCLUDED_QUANTILE)
     if not used:
         return None
     widths, stated, weights = np.array([(value.mm, value.deviation or 0.0, value.confidence) for value in used]).T
@@ -181,7 +198,7 @@ def _robust(values: list[_Value]) -> Width | None:
     error = math.hypot(
         of_pairs * math.sqrt(1.0 + _FEW / len(widths)),
         _MASK_ERROR * float(np.median([value.pixel for value in used])),
-        _HIDING_ERROR * (1.0 - len(clear) / len(values)),
+        _OCCLUSION_ERROR * (1.0 - len(clear) / len(values)),
         _CALIBRATION_ERROR * middle,
     )
     return Width(middle, error, of_pairs, len(widths))

@@ -6,18 +6,18 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, find_ground
-from jaxrl_vis.stalks.phenotyping.measure.stalk import DEPTHS, measure, stalk_disparity
-from jaxrl_vis.stalks.phenotyping.measure.width import strip_width
+from jaxrl_vis.stalks.phenotyping.measure.stalk import DEPTHS, measure_stalk, stalk_disparity
+from jaxrl_vis.stalks.phenotyping.measure.width import fit_strip
 from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sighting, grey_at
 from jaxrl_vis_envs.plants import Calibration
 
 _MIN_STALKS = 4
 _MIN_MEASURED = 0.7  # minimum fraction of the detections that are measured in a good pair
 _SAME_DEPTH = 0.15  # maximum relative difference of the depths of one row
-_NEAREST = 3.0  # minimum depth in baselines: below, the fields of view hardly overlap
+_MIN_DEPTH_RATIO = 3.0  # minimum depth in baselines: below, the fields of view hardly overlap
 _MIN_DISPARITY = 2.0  # pixels
 _SMALL_FRACTION, _LARGE_FRACTION = 0.25, 0.6
-_LINES = (6, 12, 24, 48)  # vertical offsets of unrectified images that are tried, pixels at a focal length of 2168
+_ROW_OFFSETS = (6, 12, 24, 48)  # vertical offsets of unrectified images that are tried, pixels at a focal length of 2168
 
 
 def pair_fault(
@@ -39,7 +39,7 @@ def pair_fault(
     """
     grey_left, grey_right = grey_at(left), grey_at(right)
     measured = sum(sighting.diameter_mm is not None for sighting in sightings)
-    fault = _upside_down(grey_left, grey_right, calibration) if ground is None else None
+    fault = _orientation_fault(grey_left, grey_right, calibration) if ground is None else None
     if fault is None and (ground is None or measured < _MIN_MEASURED * len(detections)):
         fault = _distance_fault(detections, grey_left, grey_right, calibration)
     if fault is not None:
@@ -59,14 +59,14 @@ def pair_fault(
     ]
     if _measured_fraction(turned, grey_left[:, ::-1], grey_right[:, ::-1], mirror) >= _LARGE_FRACTION:
         return "left and right are swapped: exchange their names"
-    for lines in sorted({max(round(line * calibration.focal / 2168), 3) for line in _LINES}):
+    for lines in sorted({max(round(line * calibration.focal / 2168), 3) for line in _ROW_OFFSETS}):
         for shift in (lines, -lines):
             if _measured_fraction(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _LARGE_FRACTION:
                 return f"the right image lies about {lines} lines too {'high' if shift > 0 else 'low'}: rectify the pair"
     return None
 
 
-def _upside_down(left: np.ndarray, right: np.ndarray, calibration: Calibration) -> str | None:
+def _orientation_fault(left: np.ndarray, right: np.ndarray, calibration: Calibration) -> str | None:
     """Return a message if a greyscale pair [H, W] is upside down; None if not."""
     column, line = calibration.centre
     turned = dataclasses.replace(calibration, centre=(column, calibration.height - 1 - line))
@@ -80,7 +80,9 @@ def _upside_down(left: np.ndarray, right: np.ndarray, calibration: Calibration) 
 
 def _distance_fault(detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration) -> str | None:
     """Return a message if the stalks of a greyscale pair [H, W] have an implausible depth by its calibration; None if not."""
-    depths = [depth for depth in (_any_depth(find, left, right, calibration) for find in _some(detections)) if depth]
+    depths = [
+        depth for depth in (_unconstrained_depth(find, left, right, calibration) for find in _subsample(detections)) if depth
+    ]
     if len(depths) < _MIN_STALKS:
         return None
     depth = float(np.median(depths))
@@ -94,27 +96,27 @@ def _distance_fault(detections: list[Detection], left: np.ndarray, right: np.nda
     )
 
 
-def _any_depth(find: Detection, left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float | None:
+def _unconstrained_depth(detection: Detection, left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float | None:
     """Return the depth of a detection without the usual limits, m; None if it has no clear match in the right image."""
-    strip = find.strip or strip_width(find.mask)
+    strip = detection.strip or fit_strip(detection.mask)
     if strip is None:
         return None
-    nearest = float(calibration.disparity(np.array(_NEAREST * calibration.baseline)))
-    matched = stalk_disparity(strip, find.corner, left, right, calibration, (calibration.offset + _MIN_DISPARITY, nearest))
-    at = matched.at(strip.reference + find.corner[0])
+    nearest = float(calibration.disparity(np.array(_MIN_DEPTH_RATIO * calibration.baseline)))
+    matched = stalk_disparity(strip, detection.corner, left, right, calibration, (calibration.offset + _MIN_DISPARITY, nearest))
+    at = matched.at(strip.reference + detection.corner[0])
     return None if at is None else float(calibration.depth(np.array(at[0])))
 
 
-def _some(detections: list[Detection]) -> list[Detection]:
+def _subsample(detections: list[Detection]) -> list[Detection]:
     """Return at most ten of the detections, evenly spaced."""
     return detections[:: -(-len(detections) // 10)] if detections else []
 
 
 def _measured_fraction(detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float:
     """Return the fraction of the detections, of which at most ten are tried, that can be measured with the right image."""
-    some = _some(detections)
+    some = _subsample(detections)
     left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
     measured = [
-        measure(detection.mask, detection.corner, left, right, calibration).diameter_mm is not None for detection in some
+        measure_stalk(detection.mask, detection.corner, left, right, calibration).diameter_mm is not None for detection in some
     ]
     return sum(measured) / len(measured)

@@ -14,8 +14,8 @@ from jaxrl_vis.config import fields
 from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_lines, find_ground
-from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement, Method, measure
-from jaxrl_vis.stalks.phenotyping.measure.width import strip_width
+from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement, Method, measure_stalk
+from jaxrl_vis.stalks.phenotyping.measure.width import fit_strip
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import HEIGHTS
 
@@ -29,7 +29,7 @@ _OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is foun
 _SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
 _AT_DISTANCE = 3  # minimum number of stalks to estimate the distance of the row
 _FAR_FROM_ROW = 0.2  # m: distance from the row beyond which a match is suspicious
-_OCCLUDED = 0.1  # factor of the confidence of a sighting with an edge that may be occluded
+_OCCLUSION_FACTOR = 0.1  # factor of the confidence of a sighting with an edge that may be occluded
 _BEHIND = 0.003  # m: a stalk further behind occludes nothing
 _TOUCHING = 0.1  # of half a stalk's width: distance within which edges touch
 _SAME_DEPTH = 0.06  # m: change of depth over 12 inches of a stalk that leans by 10 degrees
@@ -131,7 +131,7 @@ def grey_at(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
-def find_with_ground(
+def detect_with_ground(
     find: Find,
     left: np.ndarray,
     right: np.ndarray,
@@ -198,8 +198,11 @@ def view_pair(
         calibration: Calibration of the cameras; None if unknown.
         method: Method of measuring widths.
         disparity: Known disparities; see `measure_pair`.
+
+    Returns:
+        Detections and measurements at the distance that stereo confirms, or else at the usual one.
     """
-    detections, ground = find_with_ground(find, left, right, calibration, disparity)
+    detections, ground = detect_with_ground(find, left, right, calibration, disparity)
     frame = find_frame(left)
     sightings = measure_pair(detections, left, right, calibration, method, ground, disparity)
     usual = PairView(detections, sightings, ground, frame)
@@ -219,7 +222,7 @@ def view_pair(
 
 
 def row_distance(sightings: list[Sighting]) -> float | None:
-    """Return the median depth of the measured stalks of one or several pairs, m; None if there are too few."""
+    """Return the median depth of the measured stalks of one or several pairs, m; None if there are fewer than three."""
     depths = [sighting.depth_m for sighting in sightings if sighting.diameter_mm is not None and sighting.depth_m is not None]
     return float(np.median(depths)) if len(depths) >= _AT_DISTANCE else None
 
@@ -254,21 +257,25 @@ def measure_pair(
         line = 0.5 * (detection.box[1] + detection.box[3])
         images = (grey_left, grey_right, calibration)
         how = {"method": method, "ground": ground, "disparity": disparity}
-        measurement = measure(
+        measurement = measure_stalk(
             detection.mask, detection.corner, *images, line=line, height=HEIGHTS[0], strip=detection.strip, **how
         )
         upper = None
         if ground is not None and detection.upper is not None:
-            upper = measure(*detection.upper, *images, height=HEIGHTS[1], **how)
+            upper = measure_stalk(*detection.upper, *images, height=HEIGHTS[1], **how)
         measured.append((measurement, upper))
     measured = _without_mismatches(measured, calibration, find_frame(grey_right).columns[0])
     occluded = _occluded_edges([measurement for measurement, _ in measured])
     above = _occluded_edges([upper or Measurement() for _, upper in measured])
-    occluded = [behind or not measurement.here for behind, (measurement, _) in zip(occluded, measured)]
+    occluded = [behind or not measurement.both_edges_visible for behind, (measurement, _) in zip(occluded, measured)]
     sightings = []
     for detection, (measurement, upper), *behind in zip(detections, measured, occluded, above):
-        less = dataclasses.replace(measurement, confidence=measurement.confidence * _OCCLUDED) if behind[0] else measurement
-        sighting = _sighting(detection, less, upper, calibration)
+        less = (
+            dataclasses.replace(measurement, confidence=measurement.confidence * _OCCLUSION_FACTOR)
+            if behind[0]
+            else measurement
+        )
+        sighting = _make_sighting(detection, less, upper, calibration)
         sightings.append(dataclasses.replace(sighting, occluded=behind[0], upper_occluded=behind[1]))
     return sightings
 
@@ -327,7 +334,7 @@ def _occluded_edges(measurements: list[Measurement]) -> list[bool]:
 
 
 def _unscaled_sighting(detection: Detection) -> Sighting:
-    strip = detection.strip or strip_width(detection.mask)
+    strip = detection.strip or fit_strip(detection.mask)
     line = 0.5 * (detection.box[1] + detection.box[3])
     column = 0.5 * sum(detection.axis)
     if strip is None:
@@ -346,12 +353,14 @@ def _unscaled_sighting(detection: Detection) -> Sighting:
     )
 
 
-def _sighting(detection: Detection, measurement: Measurement, upper: Measurement | None, calibration: Calibration) -> Sighting:
+def _make_sighting(
+    detection: Detection, measurement: Measurement, upper: Measurement | None, calibration: Calibration
+) -> Sighting:
     """Build a sighting from measurements, rounded so that it is unchanged by a round trip through JSON."""
     line = measurement.line if math.isfinite(measurement.line) else 0.5 * (detection.box[1] + detection.box[3])
     column = measurement.column if math.isfinite(measurement.column) else 0.5 * sum(detection.axis)
 
-    def known(value: float | None, digits: int) -> float | None:
+    def round_or_none(value: float | None, digits: int) -> float | None:
         return None if value is None or not math.isfinite(value) else round(value, digits)
 
     # Another stalk may stand where this one's axis was extrapolated to.
@@ -368,16 +377,16 @@ def _sighting(detection: Detection, measurement: Measurement, upper: Measurement
         score=round(detection.score, 4),
         line=round(line, 2),
         column=round(column, 2),
-        width_px=known(measurement.width, 3),
-        lean_deg=known(math.degrees(measurement.lean), 2),
-        diameter_mm=known(measurement.diameter_mm, 4),
-        deviation_mm=known(measurement.deviation_mm, 4),
-        depth_m=known(measurement.depth, 5),
-        along_m=known(along, 5),
-        height_m=known(measurement.height, 4),
-        upper_mm=known(higher.diameter_mm, 4),
-        upper_deviation_mm=known(higher.deviation_mm, 4),
-        upper_height_m=known(higher.height, 4),
+        width_px=round_or_none(measurement.width, 3),
+        lean_deg=round_or_none(math.degrees(measurement.lean), 2),
+        diameter_mm=round_or_none(measurement.diameter_mm, 4),
+        deviation_mm=round_or_none(measurement.deviation_mm, 4),
+        depth_m=round_or_none(measurement.depth, 5),
+        along_m=round_or_none(along, 5),
+        height_m=round_or_none(measurement.height, 4),
+        upper_mm=round_or_none(higher.diameter_mm, 4),
+        upper_deviation_mm=round_or_none(higher.deviation_mm, 4),
+        upper_height_m=round_or_none(higher.height, 4),
         upper_confidence=round(higher.confidence, 4),
         upper_place=None
         if higher.diameter_mm is None

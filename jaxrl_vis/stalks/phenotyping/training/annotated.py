@@ -14,11 +14,11 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 from jaxrl_vis.stalks.phenotyping.detector.finder import resize_factor
 from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, UNCLEAR
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import cut
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import cut_crops
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.calibration import check_size, find_calibration, read_calibration
-from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, rgb8
-from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, outlined_mask
+from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, to_rgb8
+from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, rasterise_polygons
 from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE
 from jaxrl_vis.stalks.phenotyping.training.edges import annotated_edges
 from jaxrl_vis.stalks.phenotyping.training.examples import MAX_STALKS, Example, make_example
@@ -35,7 +35,8 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
     The scale of the images is taken from the calibration in the folder, if there is one.
 
     Raises:
-        RequestError: Annotations are missing or invalid, or an image is missing or differs in size from its annotations.
+        RequestError: Annotations are missing or invalid, the calibration is invalid or for images of another size, or an image
+            is missing or differs in size from its annotations.
     """
     data = read_annotations(folder, labels)
     resolution_of = _resolutions(folder, data["images"])
@@ -46,7 +47,7 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         size, path = (about["height"], about["width"]), folder / about["file_name"]
         try:
             there = image_size(path)
-            image = rgb8(read_image(path)) if there == size else None
+            image = to_rgb8(read_image(path)) if there == size else None
         except OSError as error:
             raise RequestError(f"the annotations in {folder} name an image that cannot be read: {error}") from error
         if image is None or image.shape[:2] != size:
@@ -58,7 +59,7 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         every = of_image.get(about["id"], [])
         annotations = [annotation for annotation in every if not annotation.get("iscrowd")]
         stalks = np.array([_annotated_stalk(annotation, size) for annotation in annotations], np.float32).reshape(-1, 6)
-        strips = _strips([annotation for annotation in every if annotation.get("iscrowd")], stalks)
+        strips = _cover_crowds([annotation for annotation in every if annotation.get("iscrowd")], stalks)
         kinds = np.array([STALK] * len(stalks) + [UNCLEAR] * len(strips), np.int32)
         stalks = np.concatenate([stalks, strips])
         rng = np.random.default_rng([number, 18])
@@ -74,7 +75,7 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         yield example
 
 
-def _strips(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarray:
+def _cover_crowds(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarray:
     """Cover crowd regions (stalks annotated together) with overlapping strips [N, 6] float32 as wide as the image's stalks.
 
     Detections are ignored by their overlap with unclear stalks, and would hardly overlap the box of a whole region.
@@ -93,17 +94,17 @@ def _strips(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarray:
 def _own_masks(
     annotations: list[dict[str, Any]],
     size: tuple[int, int],
-    parts: np.ndarray,
-    places: np.ndarray,
+    selected: np.ndarray,
+    stalks: np.ndarray,
     shape: tuple[int, int],
 ) -> np.ndarray:
-    """Cut the masks of stalk crops out of annotations; see `_MaskFunction`.
+    """Cut the masks of stalk crops out of annotations; see `MaskFunction`.
 
     One at a time: masks may overlap, and all of an image together could exceed the memory.
     """
     crops = [
-        np.asarray(cut(jnp.asarray(_annotated_mask(annotations[part], size)), places[index : index + 1], shape))
-        for index, part in enumerate(parts)
+        np.asarray(cut_crops(jnp.asarray(_annotated_mask(annotations[part], size)), stalks[index : index + 1], shape))
+        for index, part in enumerate(selected)
     ]
     return np.concatenate(crops)
 
@@ -123,7 +124,7 @@ def _resolutions(folder: Path, images: list[dict[str, Any]]) -> dict[int, float 
     return dict.fromkeys((image["id"] for image in images), calibration.focal / USUAL_DISTANCE)
 
 
-def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
+def fit_settings(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
     """Return settings with anchors adapted to the boxes of a folder's annotations.
 
     If the folder has no calibration, images are resized so that boxes are as tall as the band, or stalks as wide as those of
@@ -171,8 +172,12 @@ def _stalk_width(annotation: dict[str, Any], height: int, width: int) -> float:
     return float(mask.sum() / max(mask.any(axis=1).sum(), 1)) / width
 
 
-def any_outlined(folder: Path, labels: tuple[str, ...] = ()) -> bool:
-    """Return whether any annotated stalk of a folder has a segmentation besides its box."""
+def has_outlines(folder: Path, labels: tuple[str, ...] = ()) -> bool:
+    """Return True if any annotated stalk of a folder has a segmentation besides its box.
+
+    Raises:
+        RequestError: The annotations of the folder cannot be read.
+    """
     annotations = read_annotations(folder, labels)["annotations"]
     return any(annotation["segmentation"] and not annotation.get("iscrowd") for annotation in annotations)
 
@@ -184,11 +189,11 @@ def _annotated_mask(annotation: dict[str, Any], size: tuple[int, int]) -> np.nda
         return decode_mask(segmentation)
     left, top, wide, tall = annotation["bbox"]
     right, bottom = left + wide, top + tall
-    return outlined_mask(segmentation or [[left, top, right, top, right, bottom, left, bottom]], size)
+    return rasterise_polygons(segmentation or [[left, top, right, top, right, bottom, left, bottom]], size)
 
 
 def _annotated_stalk(annotation: dict[str, Any], size: tuple[int, int]) -> list[float]:
-    """Return the box and axis [6] of one annotation; the axis is fitted to its mask."""
+    """Return the box and axis [6] of one annotation; the axis is fitted to its mask, and vertical if that is small."""
     left, top, wide, tall = annotation["bbox"]
     right, bottom = left + wide, top + tall
     line, column = np.nonzero(_annotated_mask(annotation, size))

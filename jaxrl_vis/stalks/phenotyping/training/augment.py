@@ -49,20 +49,21 @@ def _blur(values: jax.Array, deviation: jax.Array) -> jax.Array:
     return values
 
 
-def move(
+def augment_geometry(
     images: jax.Array, stalks: jax.Array, kinds: jax.Array, sizes: jax.Array, key: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Randomly mirror, shear, stretch and shift images and their stalks; a quarter of them is mirrored at most.
+    """Mirror, shear, stretch and shift images and their stalks at random; a quarter of them may only be mirrored.
 
     Args:
         images: [N, H, W, 3] uint8, padded at the bottom and on the right.
         stalks: [N, T, 6], boxes and axes, or edges [N, T, R, 3], see `sections`.
-        kinds: [N, T] int32, see `losses.assign`.
+        kinds: [N, T] int32, see `losses.assign_boxes`.
         sizes: [N, 2] int32, height and width of the images without padding.
-        key: PRNG key.
+        key: Typed key, [].
 
     Returns:
-        Images, stalks clipped to them, and kinds, where stalks that are hardly left in the image become ``NOTHING``.
+        Images, stalks clipped to them, and kinds, where stalks that are hardly left in the image become ``NOTHING``; shapes and
+        dtypes are those of the arguments.
     """
     keys = jax.random.split(key, images.shape[0])
     return jax.vmap(_transform_stalks)(images, stalks, kinds, sizes, keys)
@@ -128,7 +129,10 @@ def _edges_at(
 
 
 def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: jax.Array) -> jax.Array:
-    """Sample an image at rows ``line`` and columns ``column`` by bilinear interpolation; black outside ``shape``."""
+    """Sample an image [H, W, 3] uint8 at rows ``line`` and columns ``column`` [h, w] by bilinear interpolation.
+
+    Pixels outside ``shape`` [2], the height and width of the image without padding, are black.
+    """
     inside = (line >= -0.5) & (line <= shape[0] - 0.5) & (column >= -0.5) & (column <= shape[1] - 0.5)
     line, column = jnp.clip(line, 0.0, shape[0] - 1.0), jnp.clip(column, 0.0, shape[1] - 1.0)
     top, left = jnp.floor(line).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)
@@ -152,7 +156,7 @@ def augment_crops(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[j
 
 
 def _stretch(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Stretch crops and masks horizontally about their centre by a factor from exp(-0.3) to exp(0.3)."""
+    """Stretch crops [N, H, W, 3] uint8 and masks [N, H, W] bool horizontally about their centres by exp(-0.3) to exp(0.3)."""
     count, _, width = crops.shape[:3]
     wider = jnp.exp(jax.random.uniform(key, (count,), minval=-0.3, maxval=0.3))
     place = (jnp.arange(width) + 0.5 - width / 2) / wider[:, None] + width / 2 - 0.5  # [N, W], source of each column
@@ -172,7 +176,10 @@ def _stretch(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Ar
 
 
 def _add_texture(crops: jax.Array, key: jax.Array) -> jax.Array:
-    """Add random speckles, fibres along the stalk and shading to crops, to cover more than the textures of a family."""
+    """Multiply crops [N, H, W, 3] uint8 by random speckles, fibres along the stalk and shading; same shape and dtype.
+
+    Together they cover more than the textures of a family of synthetic plots.
+    """
     count, height, width = crops.shape[:3]
     spots, fibres, shades, amounts = jax.random.split(key, 4)
     amount = jax.random.uniform(amounts, (4, count, 1, 1))
@@ -190,6 +197,14 @@ def _add_stripes(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Arra
     """Add light and dark stripes along the stalk to 70 % of the crops, as of ribs and folded sheaths, varying by internode.
 
     A dark stripe looks like a gap between two stalks, but the stalk continues on its other side.
+
+    Args:
+        crops: [N, H, W, 3] uint8.
+        masks: [N, H, W] bool, pixels of the stalk, which alone change.
+        key: Typed key, [].
+
+    Returns:
+        Crops of the same shape and dtype.
     """
     count, height, width = crops.shape[:3]
     keys = jax.random.split(key, 5)
@@ -213,6 +228,14 @@ def _change_contrast(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.
     The shading of a round stalk towards its edges depends on its surface and on the light. A network that overfits to it
     misplaces the edges of other stalks. The change is multiplicative, so black remains black and no edge appears where none was
     visible.
+
+    Args:
+        crops: [N, H, W, 3] uint8.
+        masks: [N, H, W] bool, pixels of the stalk, which alone change.
+        key: Typed key, [].
+
+    Returns:
+        Crops of the same shape and dtype.
     """
     count, _, width = crops.shape[:3]
     keys = jax.random.split(key, 6)

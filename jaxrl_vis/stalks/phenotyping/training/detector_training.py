@@ -18,11 +18,11 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, init_detector
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.losses import detector_loss, segmenter_loss
 from jaxrl_vis.stalks.phenotyping.detector.section_losses import section_loss
-from jaxrl_vis.stalks.phenotyping.training.augment import augment_crops, move, relight
+from jaxrl_vis.stalks.phenotyping.training.augment import augment_crops, augment_geometry, relight
 from jaxrl_vis.stalks.phenotyping.training.edges import stack_edges
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
 from jaxrl_vis.stalks.phenotyping.training.pool import Pool
-from jaxrl_vis.stalks.phenotyping.training.updates import Report, repeat
+from jaxrl_vis.stalks.phenotyping.training.updates import Report, run_updates
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Plan:
         batch: Batch size of images.
         crops: Batch size of stalk crops.
         rate: Peak learning rate.
-        average: Decay rate of the exponential moving average of the parameters.
+        average: Decay rate of the exponential moving average of the parameters; lower in the first updates.
         seed: Random seed.
     """
 
@@ -59,8 +59,13 @@ Images = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 without padding [N, 2] int32."""
 
 
-def image_batch(examples: Sequence[Example], shape: tuple[int, int]) -> Images:
-    """Batch examples; images are zero-padded at the bottom and on the right to ``shape`` (height, width)."""
+def batch_images(examples: Sequence[Example], shape: tuple[int, int]) -> Images:
+    """Return a batch of examples (`Images`); images are zero-padded at the bottom and on the right to ``shape``.
+
+    Args:
+        examples: The examples, none of whose images is larger than ``shape``.
+        shape: Height and width of the batch.
+    """
     sizes = np.array([example.image.shape[:2] for example in examples], np.int32)
     images = np.zeros((len(examples), *shape, 3), np.uint8)
     for image, example in zip(images, examples):
@@ -90,12 +95,12 @@ class _Pool(Pool[Example]):
         self._crops_by_shape.setdefault(example.crops.shape[1:3], []).extend(crops)
         super().add(example)
 
-    def images(self, rng: np.random.Generator) -> Images:
+    def sample_images(self, rng: np.random.Generator) -> Images:
         """Sample a batch of images, padded to the largest height and width so far; see `Images`."""
         chosen = [self.examples[place] for place in rng.integers(len(self.examples), size=self._plan.batch)]
-        return image_batch(chosen, padded_shape(self._largest))
+        return batch_images(chosen, padded_shape(self._largest))
 
-    def strips(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
+    def sample_crops(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
         """Sample a batch of stalk crops with their masks; return None if there are no crops yet."""
         if not self.crops:
             return None
@@ -126,9 +131,9 @@ def update_networks(
     """Update both networks once.
 
     Args:
-        state: Training state, see `beginning`; its buffers are donated.
+        state: Training state, see `init_state`; its buffers are donated.
         batch: `Images`, and a tuple of stalk crops and masks, or None if masks are not trained.
-        key: PRNG key of the augmentation and of the jittered boxes for the head.
+        key: Typed key of the augmentation and of the jittered boxes for the head.
         rates: Learning rate, and decay rate of the parameter average.
         settings: Settings of the networks.
         dtype: Compute dtype of the convolutions.
@@ -141,7 +146,7 @@ def update_networks(
     rate, decay = rates
     (images, stalks, kinds, sizes), strips = batch
     places, light, near, variation = jax.random.split(key, 4)
-    images, stalks, kinds = move(images, stalks, kinds, sizes, places)
+    images, stalks, kinds = augment_geometry(images, stalks, kinds, sizes, places)
     images = relight(images, light)
 
     def loss(params):
@@ -173,20 +178,20 @@ def _map_frozen(function: Callable[[jax.Array], jax.Array], tree: Any, frozen: t
     return jax.tree_util.tree_map_with_path(change, tree) if frozen else tree
 
 
-def beginning(params: Any) -> State:
+def init_state(params: Any) -> State:
     """Return the initial training state from parameters with keys ``detector`` and ``segmenter``, cast to float32."""
     params = jax.tree.map(lambda leaf: jnp.array(leaf, jnp.float32), params)
-    return params, *_beginning(params)
+    return params, *_init_averages(params)
 
 
 @jax.jit
-def _beginning(params: Any) -> tuple[Any, Any]:
+def _init_averages(params: Any) -> tuple[Any, Any]:
     """Return the initial parameter average and optimiser state."""
     return jax.tree.map(jnp.copy, params), _optimiser().init(params)  # a donated buffer must not appear twice
 
 
-def initial_networks(settings: Settings, detector_key: jax.Array, segmenter_key: jax.Array) -> dict[str, Any]:
-    """Initialise the parameters of both networks at random."""
+def init_networks(settings: Settings, detector_key: jax.Array, segmenter_key: jax.Array) -> dict[str, Any]:
+    """Initialise the parameters of both networks at random, as float32 with keys ``detector`` and ``segmenter``."""
     blank = jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
     return {
         "detector": init_detector(settings, detector_key),
@@ -242,20 +247,20 @@ def train(
     dtype = jnp.bfloat16 if jax.default_backend() in ("gpu", "tpu") else jnp.float32
     pool = _Pool(sources, plan)
     detector_key, segmenter_key, steps_key = jax.random.split(root, 3)
-    state = beginning(initial_networks(settings, detector_key, segmenter_key) if start is None else start)
+    state = init_state(init_networks(settings, detector_key, segmenter_key) if start is None else start)
 
     def update(step: int, rates: tuple[jax.Array, jax.Array]) -> tuple[dict[str, jax.Array], Any] | None:
         nonlocal state
-        strips = pool.strips(rng)
+        strips = pool.sample_crops(rng)
         if strips is None:
             return None
-        batch, key = (pool.images(rng), strips), jax.random.fold_in(steps_key, step)
+        batch, key = (pool.sample_images(rng), strips), jax.random.fold_in(steps_key, step)
         state, parts = update_networks(state, batch, key, rates, settings, dtype)
         return parts, state[1]
 
     try:
         pool.fill(plan.first)
-        step = repeat(update, pool, plan, started, report, report_interval)
+        step = run_updates(update, pool, plan, started, report, report_interval)
     finally:
         pool.close()
     return state[1], step

@@ -13,7 +13,7 @@ import numpy as np
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 from jaxrl_vis.stalks.phenotyping.detector.finder import resize, upper_segment
 from jaxrl_vis.stalks.phenotyping.detector.sections import NOTHING, STALK, STEP, UNCLEAR
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut_crops
 from jaxrl_vis.stalks.phenotyping.training.edges import Edges, boxes_of, cut_edges, synthetic_edges
 from jaxrl_vis_envs.plants import Calibration, Family, draw
 from jaxrl_vis_envs.plants.cameras import Pose
@@ -46,7 +46,7 @@ class Example:
         image: Resized image [h, w, 3] uint8.
         stalks: [T, 6] float32, boxes, and x coordinates of the axis at the top and bottom of the box, pixels of the resized
             image; padded to T = `MAX_STALKS`.
-        kinds: [T] int32: `losses.NOTHING` (padding), ``UNCLEAR`` or ``STALK``.
+        kinds: [T] int32: `sections.NOTHING` (padding), ``UNCLEAR`` or ``STALK``.
         crops: Stalk crops [S, H, W, 3] uint8 at full resolution; S is not padded.
         masks: Masks [S, H, W] bool of the crops.
         edges: Edges [T, R, 3] of the stalks in the resized image and their kinds [T]; None for networks without sections.
@@ -63,11 +63,13 @@ class Example:
 def synthetic_examples(family: Family, settings: Settings, seed: int, frames: int = 4) -> list[Example]:
     """Render the training examples of one synthetic plot.
 
+    Images of a daylight family are rendered at random scales and cropped at random to the size in ``settings``.
+
     Args:
         family: Family from which the plot is sampled.
         settings: Settings of the networks.
         seed: Seed of the plot.
-        frames: Number of images, spread over the plot; fewer if it has fewer.
+        frames: Maximum number of images, spread over the plot.
     """
     sequence = Sequence.of(draw(family, seed))
     settled = sequence.plot.family
@@ -100,13 +102,16 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         if by_day:
             # Lenses and scales differ between plots, and each shape of crops would need a compilation.
             shape = crop_shape((settings.crop_height, settings.crop_width), family.rig.width / settings.full_width)
-            example = resize_crops(cut_out(example, (settings.lines, settings.width), rng), shape)
+            example = resize_crops(crop_randomly(example, (settings.lines, settings.width), rng), shape)
         examples.append(example)
     return examples
 
 
 def resize_crops(example: Example, shape: tuple[int, int]) -> Example:
-    """Resize the stalk crops and masks of an example to ``shape`` (height, width)."""
+    """Resize the stalk crops and masks of an example to ``shape`` (height, width).
+
+    Return the example itself if they have that size, or if there are none.
+    """
     if not len(example.crops) or example.crops.shape[1:3] == shape:
         return example
     size = (shape[1], shape[0])
@@ -115,7 +120,7 @@ def resize_crops(example: Example, shape: tuple[int, int]) -> Example:
     return dataclasses.replace(example, crops=crops, masks=np.stack(masks))
 
 
-def cut_out(example: Example, max_size: tuple[int, int], rng: np.random.Generator) -> Example:
+def crop_randomly(example: Example, max_size: tuple[int, int], rng: np.random.Generator) -> Example:
     """Crop the image of an example at random, mostly around a stalk.
 
     Args:
@@ -166,11 +171,22 @@ def _clip_stalks(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
 
 
 def _instance_masks(
-    instance: jax.Array, indices: np.ndarray, parts: np.ndarray, places: np.ndarray, shape: tuple[int, int]
+    instance: jax.Array, indices: np.ndarray, selected: np.ndarray, stalks: np.ndarray, shape: tuple[int, int]
 ) -> np.ndarray:
-    """Cut the masks of stalk crops out of an instance segmentation; see `MaskFunction`."""
-    cut_out = np.asarray(cut(instance + 1, places, shape))[: len(parts)]  # 0 is outside the image
-    return cut_out == indices[parts][:, None, None] + 1
+    """Cut the masks of stalk crops out of an instance segmentation. With the first two arguments bound, a `MaskFunction`.
+
+    Args:
+        instance: [H, W] int, index of the stalk at each pixel.
+        indices: [T] int, index in ``instance`` of each stalk that has a box, see `true_boxes`.
+        selected: [N] int, positions in ``indices`` of the stalks whose crops are cut.
+        stalks: [N or more, 6] float32, boxes and axes of these stalks; further rows are padding and are dropped.
+        shape: Height h and width w of a crop, pixels.
+
+    Returns:
+        [N, h, w] bool, False outside the image.
+    """
+    cut_out = np.asarray(cut_crops(instance + 1, stalks, shape))[: len(selected)]  # 0 is outside the image
+    return cut_out == indices[selected][:, None, None] + 1
 
 
 def true_boxes(
@@ -240,7 +256,7 @@ def make_example(
     if len(clear):
         filled = -(-len(clear) // 16) * 16  # few shapes, few compilations
         places = np.pad(places, ((0, filled - len(clear)), (0, 0)), mode="edge")
-        crops = np.asarray(cut(on_device, places, shape))[: len(clear)]
+        crops = np.asarray(cut_crops(on_device, places, shape))[: len(clear)]
         masks = mask_function(clear, places, shape)
     divisor = np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
     count = min(len(stalks), MAX_STALKS)

@@ -11,8 +11,8 @@ import numpy as np
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect
 from jaxrl_vis.stalks.phenotyping.detector.finder import segment
 from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, UNCLEAR, true_sections
-from jaxrl_vis.stalks.phenotyping.evaluation.scoring import IOU, average_precision, overlaps_with
-from jaxrl_vis.stalks.phenotyping.training.detector_training import image_batch
+from jaxrl_vis.stalks.phenotyping.evaluation.scoring import IOU, average_precision, iou_with_boxes
+from jaxrl_vis.stalks.phenotyping.training.detector_training import batch_images
 from jaxrl_vis.stalks.phenotyping.training.edges import stack_edges
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
 
@@ -22,20 +22,20 @@ MIN_SCORE = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class Finds:
+class ImageDetections:
     """Detections in one image, matched with its annotations.
 
     Attributes:
         stalks: Boxes and axes [K, 6] float32, pixels of the resized image; of sections, if the networks detect these.
         scores: [K] float32.
-        right: [K] bool, True for true positives.
+        is_correct: [K] bool, True for true positives.
         ignored: [K] bool, True for detections of unclear stalks or in crowd regions, which are not counted.
         labels: Number of annotated stalks, or of their sections.
     """
 
     stalks: np.ndarray
     scores: np.ndarray
-    right: np.ndarray
+    is_correct: np.ndarray
     ignored: np.ndarray
     labels: int
 
@@ -64,7 +64,9 @@ class Score:
     soft: float
 
 
-def find_in(params: Any, examples: Sequence[Example], shape: tuple[int, int], settings: Settings, dtype: Any) -> list[Finds]:
+def detect_in_examples(
+    params: Any, examples: Sequence[Example], shape: tuple[int, int], settings: Settings, dtype: Any
+) -> list[ImageDetections]:
     """Detect stalks in the images of examples and match them with the true ones.
 
     Args:
@@ -73,14 +75,18 @@ def find_in(params: Any, examples: Sequence[Example], shape: tuple[int, int], se
         shape: Height and width to which images are padded.
         settings: Settings of the networks.
         dtype: Compute dtype of the convolutions.
+
+    Returns:
+        Detections down to `Settings.min_score` in each image, in the same order.
     """
     finds = []
     for example in examples:
-        image = image_batch([example], shape)[0][0]
+        image = batch_images([example], shape)[0][0]
         there = jax.device_get(detect(params, image, settings, dtype))
         stalks, scores = there.stalks[there.valid], there.scores[there.valid]
         truth, kinds = true_targets(example, shape, settings)
-        finds.append(Finds(stalks, scores, *match_finds(stalks, scores, truth, kinds), int((kinds == STALK).sum())))
+        matched = match_to_annotations(stalks, scores, truth, kinds)
+        finds.append(ImageDetections(stalks, scores, *matched, int((kinds == STALK).sum())))
     return finds
 
 
@@ -100,14 +106,16 @@ def true_targets(example: Example, shape: tuple[int, int], settings: Settings) -
     return np.asarray(stalks).reshape(-1, 6), np.asarray(kinds).reshape(-1)
 
 
-def match_finds(stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def match_to_annotations(
+    stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Match detections with true stalks greedily by score, one to one, at a box overlap of at least 0.5.
 
     Args:
         stalks: Detections [K, 6].
         scores: Scores [K] of the detections.
         truth: True stalks [T, 6] of the image.
-        kinds: [T] int32: `losses.NOTHING`, ``UNCLEAR`` or ``STALK``.
+        kinds: [T] int32: `sections.NOTHING`, ``UNCLEAR`` or ``STALK``.
 
     Returns:
         True positives [K] bool, and detections of unclear stalks, which are ignored [K] bool.
@@ -115,10 +123,10 @@ def match_finds(stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds
     clear, unclear = truth[kinds == STALK], truth[kinds == UNCLEAR]
     right, free = np.zeros(len(stalks), bool), np.ones(len(clear), bool)
     for place in np.argsort(-scores, kind="stable"):
-        fitting = np.where(free, overlaps_with(stalks[place, :4], clear[:, :4]), 0.0)
+        fitting = np.where(free, iou_with_boxes(stalks[place, :4], clear[:, :4]), 0.0)
         if fitting.size and fitting.max() >= IOU:
             right[place], free[int(fitting.argmax())] = True, False
-    on_unclear = np.array([bool((overlaps_with(stalk[:4], unclear[:, :4]) >= IOU).any()) for stalk in stalks], bool)
+    on_unclear = np.array([bool((iou_with_boxes(stalk[:4], unclear[:, :4]) >= IOU).any()) for stalk in stalks], bool)
     return right, on_unclear & ~right
 
 
@@ -143,16 +151,16 @@ def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, d
     return float(np.mean(overlaps)) if overlaps else float("nan")
 
 
-def score(finds: Sequence[Finds]) -> Score:
-    """Compute the metrics of the detections in several images, pooled."""
-    labels = sum(image.labels for image in finds)
-    scores = np.concatenate([image.scores[~image.ignored] for image in finds] or [np.zeros(0)])
-    right = np.concatenate([image.right[~image.ignored] for image in finds] or [np.zeros(0, bool)])
+def score_detections(detections: Sequence[ImageDetections]) -> Score:
+    """Compute the metrics of the detections in several images, pooled; ignored detections are left out."""
+    labels = sum(image.labels for image in detections)
+    scores = np.concatenate([image.scores[~image.ignored] for image in detections] or [np.zeros(0)])
+    right = np.concatenate([image.is_correct[~image.ignored] for image in detections] or [np.zeros(0, bool)])
     counted = scores >= MIN_SCORE
     hits, count = int(right[counted].sum()), int(counted.sum())
     nothing = float("nan")
     return Score(
-        images=len(finds),
+        images=len(detections),
         labels=labels,
         finds=count,
         right=hits,

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-_SIDE = 16  # pixels: height and width of a thumbnail
-_ALIKE = 0.97  # minimum correlation of the thumbnails of copies
+_THUMBNAIL_SIZE = 16  # pixels: height and width of a thumbnail
+_MIN_CORRELATION = 0.97  # minimum correlation of the thumbnails of copies
 _COPY = re.compile(r"([._-]rf[._-][0-9a-f]{6,}|[ ._-]*(aug|copy|flip|mirror|rot)[a-z]*[ ._-]*\d*|[ ._-]*\(\d+\))$")
 MIN_IMAGES = 5
 """Minimum number of photographs to hold out any."""
@@ -35,7 +35,7 @@ class Split:
     photographs: int
 
 
-def photographs_of(names: Sequence[str], images: Sequence[np.ndarray]) -> np.ndarray:
+def group_by_photograph(names: Sequence[str], images: Sequence[np.ndarray]) -> np.ndarray:
     """Group images by photograph: copies by the name of the file or by the similarity of thumbnails.
 
     Args:
@@ -43,12 +43,12 @@ def photographs_of(names: Sequence[str], images: Sequence[np.ndarray]) -> np.nda
         images: Images [h, w, 3] uint8 of any size.
 
     Returns:
-        [N] int, equal for images of one photograph.
+        [N] int, index of the first image of the same photograph.
     """
     thumbnails = np.array([_thumbnail(image) for image in images])
     flat = thumbnails.reshape(len(images), -1)
     mirrored = thumbnails[:, :, ::-1].reshape(len(images), -1)
-    alike = np.maximum(flat @ flat.T, flat @ mirrored.T) > _ALIKE
+    alike = np.maximum(flat @ flat.T, flat @ mirrored.T) > _MIN_CORRELATION
     stems = [_stem(name) for name in names]
     alike |= np.array([[one == other for other in stems] for one in stems])
     number = np.arange(len(images))
@@ -68,18 +68,18 @@ def _stem(name: str) -> str:
 
 
 def _thumbnail(image: np.ndarray) -> np.ndarray:
-    grey = cv2.resize(image, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA).astype(np.float64).mean(axis=2)
+    grey = cv2.resize(image, (_THUMBNAIL_SIZE, _THUMBNAIL_SIZE), interpolation=cv2.INTER_AREA).astype(np.float64).mean(axis=2)
     grey -= grey.mean()
     return grey / max(float(np.sqrt((grey**2).sum())), 1e-9)
 
 
-def split(photographs: np.ndarray, seed: int) -> Split:
+def split_images(photographs: np.ndarray, seed: int) -> Split:
     """Split images by photograph: a fifth for testing, and a sixth of the rest for early stopping.
 
     With fewer than `MIN_IMAGES` photographs, all images are for training.
 
     Args:
-        photographs: [N] int, see `photographs_of`.
+        photographs: [N] int, see `group_by_photograph`.
         seed: Seed of the split.
     """
     groups = np.random.default_rng([seed, 23]).permutation(np.unique(photographs))
@@ -87,7 +87,7 @@ def split(photographs: np.ndarray, seed: int) -> Split:
     test = max(round(count / 5), 1) if count >= MIN_IMAGES else 0
     stop = max(round((count - test) / 6), 1) if count >= MIN_IMAGES else 0
 
-    def part(chosen: np.ndarray) -> tuple[int, ...]:
+    def select(chosen: np.ndarray) -> tuple[int, ...]:
         return tuple(np.flatnonzero(np.isin(photographs, chosen)).tolist())
 
-    return Split(part(groups[test + stop :]), part(groups[test : test + stop]), part(groups[:test]), count)
+    return Split(select(groups[test + stop :]), select(groups[test : test + stop]), select(groups[:test]), count)

@@ -20,13 +20,13 @@ import numpy as np
 from jaxrl_vis.errors import NonFiniteError
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, padded_shape
 from jaxrl_vis.stalks.phenotyping.training.detector_training import (
-    beginning,
-    image_batch,
-    initial_networks,
+    batch_images,
+    init_networks,
+    init_state,
     update_networks,
 )
-from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out, resize_crops
-from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, find_in, score
+from jaxrl_vis.stalks.phenotyping.training.examples import Example, crop_randomly, resize_crops
+from jaxrl_vis.stalks.phenotyping.training.held_out import ImageDetections, detect_in_examples, score_detections
 from jaxrl_vis.stalks.phenotyping.training.photographs import Split
 
 FROZEN = ("stem", "fine")
@@ -35,7 +35,7 @@ _WARM_UP = 50  # updates of linear warm-up of the learning rate
 _STRIP, _BESIDE = 256, 3.0  # minimum width of training crops: pixels, and multiples of the widest box
 _HEARTBEAT = 10.0  # s between progress messages of long operations
 
-Say = Callable[[str], None]
+ProgressCallback = Callable[[str], None]
 """Callback that is called with a line of text on the progress."""
 
 
@@ -49,7 +49,7 @@ class Tuning:
         batch: Batch size of images.
         crops: Batch size of stalk crops; 0 if masks are not trained.
         rate: Peak learning rate.
-        look: Number of updates between evaluations on held-out images.
+        evaluation_interval: Number of updates between evaluations on held-out images.
         patience: Number of evaluations without improvement after which training stops.
         seed: Random seed.
     """
@@ -59,54 +59,57 @@ class Tuning:
     batch: int
     crops: int
     rate: float
-    look: int = 25
+    evaluation_interval: int = 25
     patience: int = 8
     seed: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
-class Tuned:
+class TuningResult:
     """Result of fine-tuning.
 
     Attributes:
         params: Best parameters, with keys ``detector`` and ``segmenter``; the last ones if no images are held out.
-        steps: Number of updates after which these parameters were reached.
-        made: Total number of updates.
-        why: Reason why training ended.
+        best_step: Number of updates after which these parameters were reached.
+        updates: Total number of updates.
+        stop_reason: Reason why training ended.
         before, after: Detections in each test image with the initial and the resulting parameters.
         compile_s, update_s: Durations of compilation, and of updates and evaluations, s.
     """
 
     params: Any
-    steps: int
-    made: int
-    why: str
-    before: list[Finds]
-    after: list[Finds]
+    best_step: int
+    updates: int
+    stop_reason: str
+    before: list[ImageDetections]
+    after: list[ImageDetections]
     compile_s: float
     update_s: float
 
 
 def tune(
     examples: Sequence[Example],
-    parts: Split,
+    split: Split,
     settings: Settings,
     tuning: Tuning,
     start: Any,
-    echo: Say,
+    echo: ProgressCallback,
     keep: Callable[[Any, int], None] = lambda params, step: None,
-) -> Tuned:
+) -> TuningResult:
     """Fine-tune the networks on annotated images.
 
     Args:
         examples: Examples of all images.
-        parts: Split of the examples.
+        split: Split of the examples.
         settings: Settings of the networks.
         tuning: Fine-tuning schedule.
         start: Initial parameters, whose first layers are frozen; None for random initialisation.
-        echo: Progress callback, see `Say`.
+        echo: Progress callback, see `ProgressCallback`.
         keep: Called with the best parameters so far and their update, so that they survive an interruption. Without images for
             early stopping, called with the latest parameters at each evaluation.
+
+    Returns:
+        The parameters, on the host, with the best score on the images for early stopping, or the last ones without such images.
 
     Raises:
         NonFiniteError: A loss is not finite.
@@ -114,21 +117,21 @@ def tune(
     dtype = jnp.bfloat16 if jax.default_backend() in ("gpu", "tpu") else jnp.float32
     frozen = ((*FROZEN,) if start is not None else ()) + (() if tuning.crops else ("segmenter",))
     detector_key, segmenter_key, steps_key = jax.random.split(jax.random.key(tuning.seed), 3)
-    state = beginning(start if start is not None else initial_networks(settings, detector_key, segmenter_key))
+    state = init_state(start if start is not None else init_networks(settings, detector_key, segmenter_key))
     shape = padded_shape(_largest(examples))
-    batches = _Batches([examples[place] for place in parts.train], shape, tuning)
-    stop, test = ([examples[place] for place in part] for part in (parts.stop, parts.test))
+    batches = _Batches([examples[place] for place in split.train], shape, tuning)
+    stop, test = ([examples[place] for place in part] for part in (split.stop, split.test))
 
     began = time.monotonic()
     words = f"compiling for images of {shape[1]} x {shape[0]} pixels on {jax.default_backend()}"
     with heartbeat(words, echo):
         zeros = jnp.float32(0.0), jnp.float32(0.0)
         update = update_networks.lower(state, batches.draw(), steps_key, zeros, settings, dtype, frozen).compile()
-        before = find_in(state[1]["detector"], test, shape, settings, dtype)
+        before = detect_in_examples(state[1]["detector"], test, shape, settings, dtype)
     compile_s = time.monotonic() - began
     echo(f"compiled in {compile_s:.0f} s; --minutes count from here")
 
-    watch = _Watch(stop, shape, settings, dtype, state[1], tuning.patience)
+    watch = _EarlyStopping(stop, shape, settings, dtype, state[1], tuning.patience)
     if stop:
         echo(f"before: score {watch.best:.3f} on {len(stop)} images that decide when to stop")
     started, step, why = time.monotonic(), 0, f"{tuning.steps} updates are made"
@@ -144,28 +147,28 @@ def tune(
         state, losses = update(state, batches.draw(), jax.random.fold_in(steps_key, step), rates)
         step += 1
         reports = step == 1 or time.monotonic() - last > _HEARTBEAT
-        if reports or step % tuning.look == 0:
+        if reports or step % tuning.evaluation_interval == 0:
             values = {name: float(value) for name, value in losses.items()}
             if not np.isfinite(list(values.values())).all():
                 raise NonFiniteError(f"a loss is not finite at step {step}: try a lower --rate")
             line = "  ".join(f"{name} {value:.3f}" for name, value in values.items())
-            looked = watch.look(state[1], step) if step % tuning.look == 0 else ""
-            if step % tuning.look == 0 and (watch.step == step or not stop):
+            looked = watch.evaluate(state[1], step) if step % tuning.evaluation_interval == 0 else ""
+            if step % tuning.evaluation_interval == 0 and (watch.step == step or not stop):
                 keep(state[1], step)
             echo(f"{(time.monotonic() - started) / 60:5.1f} min  {progress:4.0%}  step {step}  {line}{looked}")
             last = time.monotonic()
-        if watch.over:
-            why = f"the score has not become better for {tuning.patience * tuning.look} updates"
+        if watch.should_stop:
+            why = f"the score has not become better for {tuning.patience * tuning.evaluation_interval} updates"
             break
-    if stop and step % tuning.look:
-        watch.look(state[1], step)
+    if stop and step % tuning.evaluation_interval:
+        watch.evaluate(state[1], step)
     params, best = (watch.params, watch.step) if stop else (state[1], step)
     update_s = time.monotonic() - started
-    after = find_in(params["detector"], test, shape, settings, dtype)
-    return Tuned(jax.device_get(params), best, step, why, before, after, compile_s, update_s)
+    after = detect_in_examples(params["detector"], test, shape, settings, dtype)
+    return TuningResult(jax.device_get(params), best, step, why, before, after, compile_s, update_s)
 
 
-class _Watch:
+class _EarlyStopping:
     """Early stopping: evaluate parameters on held-out images and keep the best ones, which may be the initial ones."""
 
     def __init__(
@@ -176,9 +179,13 @@ class _Watch:
         self.best = self._score(params)
 
     def _score(self, params: Any) -> float:
-        return score(find_in(params["detector"], self._examples, *self._about)).soft if self._examples else 0.0
+        return (
+            score_detections(detect_in_examples(params["detector"], self._examples, *self._about)).soft
+            if self._examples
+            else 0.0
+        )
 
-    def look(self, params: Any, step: int) -> str:
+    def evaluate(self, params: Any, step: int) -> str:
         """Evaluate new parameters and return text for the progress line, empty without held-out images."""
         if not self._examples:
             return ""
@@ -190,7 +197,7 @@ class _Watch:
         return f"  held out {now:.3f}" + ("" if self._since else ", the best so far")
 
     @property
-    def over(self) -> bool:
+    def should_stop(self) -> bool:
         """True if the score has not improved for ``patience`` evaluations."""
         return bool(self._examples) and self._since >= self._patience
 
@@ -204,23 +211,26 @@ class _Batches:
         widest = max(float((stalk[2] - stalk[0]).max()) for stalk in (example.stalks.T for example in examples))
         self._shape = shape[0], min(shape[1], padded_shape((1, max(_STRIP, round(_BESIDE * widest))))[1])
         self._rng = np.random.default_rng(tuning.seed)
-        self._crops, self._masks = _alike(examples) if tuning.crops else (np.zeros(0), np.zeros(0))
+        self._crops, self._masks = _stack_crops(examples) if tuning.crops else (np.zeros(0), np.zeros(0))
 
     def draw(self) -> Any:
         """Sample a batch for `update_networks`."""
         chosen = [
-            cut_out(self._examples[place], self._shape, self._rng)
+            crop_randomly(self._examples[place], self._shape, self._rng)
             for place in self._rng.integers(len(self._examples), size=self._tuning.batch)
         ]
         strips = None
         if len(self._crops):
             places = self._rng.integers(len(self._crops), size=self._tuning.crops)
             strips = self._crops[places], self._masks[places]
-        return image_batch(chosen, self._shape), strips
+        return batch_images(chosen, self._shape), strips
 
 
-def _alike(examples: list[Example]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stalk crops [N, H, W, 3] uint8 and masks [N, H, W] bool of all examples, resized to their median size."""
+def _stack_crops(examples: list[Example]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the stalk crops [N, H, W, 3] uint8 and masks [N, H, W] bool of all examples, resized to one size.
+
+    The size is the median one of all crops; N is 0 if there are none.
+    """
     shapes = sorted(example.crops.shape[1:3] for example in examples for _ in example.crops)
     if not shapes:
         return np.zeros((0, 8, 8, 3), np.uint8), np.zeros((0, 8, 8), bool)
@@ -235,7 +245,7 @@ def _largest(examples: Sequence[Example]) -> tuple[int, int]:
 
 
 @contextlib.contextmanager
-def heartbeat(message: str, echo: Say) -> Iterator[None]:
+def heartbeat(message: str, echo: ProgressCallback) -> Iterator[None]:
     """Report progress through ``echo`` at the start and every ten seconds while the context is active."""
     over, began = threading.Event(), time.monotonic()
 

@@ -32,7 +32,7 @@ class Schedule(Protocol):
     def average(self) -> float: ...  # noqa: D102
 
 
-def repeat(update: Update, pool: Pool, plan: Schedule, start_time: float, report: Report, report_interval: float) -> int:
+def run_updates(update: Update, pool: Pool, plan: Schedule, start_time: float, report: Report, report_interval: float) -> int:
     """Run updates until the plan's steps or minutes are reached.
 
     The learning rate has a linear warm-up over 200 updates and a cosine decay in progress, which follows steps or time.
@@ -49,7 +49,7 @@ def repeat(update: Update, pool: Pool, plan: Schedule, start_time: float, report
         Number of updates.
 
     Raises:
-        NonFiniteError: A reported loss is not finite.
+        NonFiniteError: A loss is not finite when it is to be reported.
         RequestError: The time limit was reached before the first update.
     """
     last_report, step, before = start_time, 0, None

@@ -30,7 +30,7 @@ _NONE = -1e30  # reach of a candidate outside of the overlap
 
 
 class _Box(NamedTuple):
-    """Position, axes (three vectors) and half-size of a box in the world."""
+    """Position (m), axes (three unit vectors) and half-size (m) of a box in the world."""
 
     position: Vector
     axes: tuple[Vector, Vector, Vector]
@@ -38,44 +38,52 @@ class _Box(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """Point of the other face, in its half edges, and True if it lies in the overlap of the faces."""
+    """Point of the incident face, in units of its half edges, and True if it lies in the overlap of the faces."""
 
     x: Any
     y: Any
     is_inside: Any
 
 
-class Place(NamedTuple):
-    """Position and axes (three vectors) of a box in the world."""
+class BoxPose(NamedTuple):
+    """Position (m) and axes (three unit vectors) of a box in the world."""
 
     position: Vector
     axes: tuple[Vector, Vector, Vector]
 
 
-def places(contacts: LaneContacts, frames: LinkFrames) -> list[list[Place]]:
-    """Return the places of the boxes that move, for each side."""
-    return [[_place(frame, frames) for _, frame in side.moving] for side in contacts.sides]
+def moving_poses(contacts: LaneContacts, frames: LinkFrames) -> list[list[BoxPose]]:
+    """Return the poses in the world (m) of the boxes that move, for each of the two sides."""
+    return [[_pose(frame, frames) for _, frame in side.moving] for side in contacts.sides]
 
 
-def _place(frame: FixedFrame, frames: LinkFrames) -> Place:
+def _pose(frame: FixedFrame, frames: LinkFrames) -> BoxPose:
     x, y, z = (frames.direction(frame.link, frame.rotation[:, axis]) for axis in range(3))
-    return Place(frames.point(frame.link, frame.position), (x, y, z))
+    return BoxPose(frames.point(frame.link, frame.position), (x, y, z))
 
 
-def contact_points(contacts: LaneContacts, places: list[list[Place]]) -> ContactPoint:
-    """Return the contacts of all lanes, from the result of `places`; normals point from the first box to the second."""
-    one, other = (_box(side, moving) for side, moving in zip(contacts.sides, places, strict=True))
-    reference, other, is_first = _reference_first(one, other)
-    offset = _into(reference.axes, subtract(other.position, reference.position))
-    other = _nearest_face_last(reference, other)
-    columns = [_into(reference.axes, axis) for axis in other.axes]
+def contact_points(contacts: LaneContacts, poses: list[list[BoxPose]]) -> ContactPoint:
+    """Return the contacts of all lanes, m in the world.
+
+    Args:
+        contacts: Constants of the contacts.
+        poses: Result of `moving_poses`.
+
+    Returns:
+        Contacts, with normals from the first box to the second; the distance of one that does not exist is `_FAR`.
+    """
+    first, second = (_box(side, moving) for side, moving in zip(contacts.sides, poses, strict=True))
+    reference, incident, is_first = _order_boxes(first, second)
+    offset = _to_frame(reference.axes, subtract(incident.position, reference.position))
+    incident = _align_nearest_face(reference, incident)
+    columns = [_to_frame(reference.axes, axis) for axis in incident.axes]
     side = jnp.where(offset[2] >= 0, 1.0, -1.0)
     towards = jnp.where(columns[2][2] >= 0, 1.0, -1.0)
-    centre = subtract(offset, scale(columns[2], side * towards * other.half_size[2]))
-    edges = scale(columns[0], other.half_size[0]), scale(columns[1], other.half_size[1])
+    centre = subtract(offset, scale(columns[2], side * towards * incident.half_size[2]))
+    edges = scale(columns[0], incident.half_size[0]), scale(columns[1], incident.half_size[1])
     zero = 0.0 * centre[0]
     x, y, exists = in_own_block(
-        lambda face: _farthest(contacts, _candidates(*face)), (centre, edges, reference.half_size), (zero, zero, zero)
+        lambda face: _select_candidate(contacts, _candidates(*face)), (centre, edges, reference.half_size), (zero, zero, zero)
     )
     point = add(centre, scale(edges[0], x), scale(edges[1], y))
     distance = minus(side * point[2], reference.half_size[2])
@@ -85,75 +93,81 @@ def contact_points(contacts: LaneContacts, places: list[list[Place]]) -> Contact
     return ContactPoint(jnp.where(exists > 0.5, distance, _FAR), position, normal)
 
 
-def _box(side: Side, moving: list[Place]) -> _Box:
+def _box(side: Side, moving: list[BoxPose]) -> _Box:
     """Return the box of a side in each lane."""
-    place = Place(side.position, side.axes)  # type: ignore[arg-type] - of three
-    for (is_here, _), other in zip(side.moving, moving, strict=True):
+    pose = BoxPose(side.position, side.axes)  # type: ignore[arg-type] - of three
+    for (is_here, _), moving_pose in zip(side.moving, moving, strict=True):
         condition = is_here == 1.0 if isinstance(is_here, float) else is_here > 0.5
-        place = _choose_parts(condition, other, place)
-    return _Box(*place, side.half_size)  # type: ignore[arg-type] - of three
+        pose = _choose_tree(condition, moving_pose, pose)
+    return _Box(*pose, side.half_size)  # type: ignore[arg-type] - of three
 
 
-def _into(axes: tuple[Vector, Vector, Vector], vector: Vector) -> Vector:
+def _to_frame(axes: tuple[Vector, Vector, Vector], vector: Vector) -> Vector:
     """Express a vector in the frame with these axes."""
     return dot(axes[0], vector), dot(axes[1], vector), dot(axes[2], vector)
 
 
-def _reference_first(one: _Box, other: _Box) -> tuple[_Box, _Box, Any]:
-    """Order two boxes, and turn the axes of the first so that its face farthest from the other is across the last axis.
+def _order_boxes(first: _Box, second: _Box) -> tuple[_Box, _Box, Any]:
+    """Order two boxes, and permute the axes of the first so that its face farthest from the second is normal to the last axis.
 
     Returns:
-        The boxes in order, and True where the order is the given one.
+        The boxes in order, and True in lanes where that is the order of the arguments.
     """
-    offset = subtract(other.position, one.position)
-    turn = [[_abs(dot(axis, across)) for across in other.axes] for axis in one.axes]
+    offset = subtract(second.position, first.position)
+    cosines = [[_abs(dot(axis, across)) for across in second.axes] for axis in first.axes]
     gaps = []
-    for box, opposite, rows in ((one, other, turn), (other, one, list(zip(*turn, strict=True)))):
+    for box, opposite, rows in ((first, second, cosines), (second, first, list(zip(*cosines, strict=True)))):
         for axis, extent, row in zip(box.axes, box.half_size, rows, strict=True):
             reach = plus(*(times(*pair) for pair in zip(row, opposite.half_size, strict=True)))
             gaps.append(minus(minus(_abs(dot(axis, offset)), extent), reach))
-    face = _greatest(gaps)
+    face = _argmax(gaps)
     is_first = face < 3.0
     axis = jnp.where(is_first, face, face - 3.0)
-    return _turn_axes(_choose_parts(is_first, one, other), axis), _choose_parts(is_first, other, one), is_first
+    return _permute_axes(_choose_tree(is_first, first, second), axis), _choose_tree(is_first, second, first), is_first
 
 
-def _nearest_face_last(reference: _Box, other: _Box) -> _Box:
-    """Turn the axes of the other box so that its face nearest to the reference is across the last axis."""
-    return _turn_axes(other, _greatest([_abs(dot(reference.axes[2], axis)) for axis in other.axes]))
+def _align_nearest_face(reference: _Box, incident: _Box) -> _Box:
+    """Permute the axes of the incident box so that its face nearest to the reference is normal to the last axis."""
+    return _permute_axes(incident, _argmax([_abs(dot(reference.axes[2], axis)) for axis in incident.axes]))
 
 
-def _greatest(numbers: list[Any]) -> Any:
-    """Return the index of the first of the greatest numbers, as float32."""
-    best, index = numbers[0], 0.0 * numbers[0]
-    for place, number in enumerate(numbers[1:], start=1):
-        is_greater = number > best
-        best, index = jnp.where(is_greater, number, best), jnp.where(is_greater, float(place), index)
+def _argmax(values: list[Any]) -> Any:
+    """Return the index of the maximum of ``values`` in each lane, as float32; the first index in a tie."""
+    best, index = values[0], 0.0 * values[0]
+    for position, value in enumerate(values[1:], start=1):
+        is_greater = value > best
+        best, index = jnp.where(is_greater, value, best), jnp.where(is_greater, float(position), index)
     return index
 
 
-def _choose_parts(condition: Any, one: Any, other: Any) -> Any:
-    """Select between two tuples of the same structure, part by part."""
-    if isinstance(one, tuple):
-        parts = [_choose_parts(condition, *pair) for pair in zip(one, other, strict=True)]
-        return type(one)(*parts) if hasattr(one, "_fields") else tuple(parts)
-    is_same = isinstance(one, float) and isinstance(other, float) and one == other
-    return one if is_same else choose(condition, one, other)
+def _choose_tree(condition: Any, if_true: Any, if_false: Any) -> Any:
+    """Select between two nested tuples of the same structure, leaf by leaf."""
+    if isinstance(if_true, tuple):
+        parts = [_choose_tree(condition, *pair) for pair in zip(if_true, if_false, strict=True)]
+        return type(if_true)(*parts) if hasattr(if_true, "_fields") else tuple(parts)
+    is_same = isinstance(if_true, float) and isinstance(if_false, float) and if_true == if_false
+    return if_true if is_same else choose(condition, if_true, if_false)
 
 
-def _turn_axes(box: _Box, axis: Any) -> _Box:
+def _permute_axes(box: _Box, axis: Any) -> _Box:
     """Permute the axes of a box cyclically, so that ``axis`` is the last."""
     is_zero, is_one = axis < 0.5, (axis > 0.5) & (axis < 1.5)
 
-    def pick(parts: tuple[Any, ...], place: int) -> Any:
-        return jnp.where(is_zero, parts[(place + 1) % 3], jnp.where(is_one, parts[(place + 2) % 3], parts[place]))
+    def pick(values: tuple[Any, ...], index: int) -> Any:
+        return jnp.where(is_zero, values[(index + 1) % 3], jnp.where(is_one, values[(index + 2) % 3], values[index]))
 
-    axes = [tuple(pick(tuple(own[part] for own in box.axes), place) for part in range(3)) for place in range(3)]
-    return _Box(box.position, tuple(axes), tuple(pick(box.half_size, place) for place in range(3)))  # type: ignore[arg-type]
+    axes = [tuple(pick(tuple(old[part] for old in box.axes), index) for part in range(3)) for index in range(3)]
+    return _Box(box.position, tuple(axes), tuple(pick(box.half_size, index) for index in range(3)))  # type: ignore[arg-type]
 
 
 def _candidates(centre: Vector, edges: tuple[Vector, Vector], half_size: Vector) -> list[_Candidate]:
-    """Return 24 points: the corners of the other face, those of the reference, and the crossings of their edges."""
+    """Return 24 points of the incident face: its corners, those of the reference face, and the intersections of their edges.
+
+    Args:
+        centre: Centre of the incident face in the frame of the reference box, m.
+        edges: Half edges of the incident face in that frame, m.
+        half_size: Half-size of the reference box, m.
+    """
     (a, c, _), (b, d, _) = edges
     inverse = 1.0 / (a * d - b * c)
     places: list[tuple[Any, Any]] = list(CORNERS)
@@ -183,8 +197,11 @@ def _candidates(centre: Vector, edges: tuple[Vector, Vector], half_size: Vector)
     return found
 
 
-def _farthest(contacts: LaneContacts, candidates: list[_Candidate]) -> tuple[Any, Any, Any]:
-    """Return the candidate that reaches farthest towards each lane's corner, and 1 if no corner before has it, else 0."""
+def _select_candidate(contacts: LaneContacts, candidates: list[_Candidate]) -> tuple[Any, Any, Any]:
+    """Return coordinates x and y of the candidate in the overlap that reaches farthest towards each lane's corner.
+
+    The third result is 1.0 if there is one and no earlier corner of the pair selects it, else 0.0.
+    """
     like = 0.0 * (candidates[4].x + contacts.number)
     own, place_x, place_y, index = like + _NONE, like, like, like
     reaches, chosen = [like + _NONE] * (CONTACTS - 1), [like] * (CONTACTS - 1)

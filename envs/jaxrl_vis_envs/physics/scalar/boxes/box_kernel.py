@@ -61,14 +61,14 @@ def simulate_arrays(
     count: int,
     mocap: jax.Array | None = None,
 ) -> JointState:
-    """Do the same as `simulate` in plain JAX."""
+    """Implement `simulate` in plain JAX."""
 
-    def spread(numbers: jax.Array) -> list[jax.Array]:
+    def broadcast(numbers: jax.Array) -> list[jax.Array]:
         return [jnp.broadcast_to(number, (LANES,)) for number in numbers]
 
-    start, poses = JointState(*map(spread, state)), [] if mocap is None else spread(mocap.reshape(-1))
+    start, poses = JointState(*map(broadcast, state)), [] if mocap is None else broadcast(mocap.reshape(-1))
     table = list(jnp.asarray(model.table, jnp.float32))
-    end = box_steps.simulate(model, table, start, spread(control), spread(applied), timestep, count, poses)
+    end = box_steps.simulate(model, table, start, broadcast(control), broadcast(applied), timestep, count, poses)
     return JointState(*(jnp.stack([number[0] for number in part]) for part in end))
 
 
@@ -82,9 +82,9 @@ class _KernelConstants:
     count: int
 
 
-def _simulate_episode(known: _KernelConstants, rows: list[jax.Array], table: list[jax.Array]) -> list[jax.Array]:
+def _simulate_episode(constants: _KernelConstants, rows: list[jax.Array], table: list[jax.Array]) -> list[jax.Array]:
     """Compute the final `JointState` of an episode from its inputs, both as flat lists of scalars."""
-    tree, freedoms = known.model.tree, len(known.model.contacts.signs)
+    tree, freedoms = constants.model.tree, len(constants.model.contacts.signs)
     sizes = (freedoms + 1, freedoms, freedoms, freedoms, len(tree.actuators), 7 * len(tree.mocaps))
     parts = []
     for size in sizes:
@@ -92,7 +92,7 @@ def _simulate_episode(known: _KernelConstants, rows: list[jax.Array], table: lis
         rows = rows[size:]
     position, velocity, acceleration, applied, control, mocap = parts
     start = JointState(position, velocity, acceleration, [0.0 * number for number in velocity])
-    end = box_steps.simulate(known.model, table, start, control, applied, known.timestep, known.count, mocap)
+    end = box_steps.simulate(constants.model, table, start, control, applied, constants.timestep, constants.count, mocap)
     return [number for part in end for number in part]
 
 

@@ -22,7 +22,7 @@ CONTACTS = 4
 """Contacts of a pair of boxes."""
 CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))
 """Direction in which each contact of a pair reaches farthest, in half edges of the face."""
-FREE_JOINTS = 6
+FREE_DOFS = 6
 """Degrees of freedom of the free body, the last of a model."""
 _NEVER = -1e6  # margin of lanes without a contact, m
 
@@ -40,7 +40,7 @@ class Side(NamedTuple):
         position: Position in the world of boxes that do not move, m.
         axes: Axes in the world of boxes that do not move, three vectors.
         half_size: Half lengths of the edges, m.
-        moving: Boxes that move: 1 in the lanes of each, 0 elsewhere; and its frame.
+        moving: For each box that moves, 1 in its lanes and 0 elsewhere, and its frame relative to its link.
     """
 
     position: tuple[Any, ...]
@@ -63,8 +63,7 @@ class LaneContacts(NamedTuple):
         spring: Stiffness (1/s^2) and damping (1/s) of the reference spring.
         impedance: Impedance without violation, its increase up to its width, and the inverse of that width, 1/m.
         midpoint: Inflection point of the impedance, as a fraction of the width; its exponent is 2.
-        signs: 1 for each joint that moves the second box alone, -1 for the first alone, 0 for both or none: of all degrees of
-            freedom.
+        signs: For each degree of freedom, 1 if it moves only the second box, -1 if only the first, 0 if both or neither.
     """
 
     sides: tuple[Side, Side]
@@ -85,9 +84,9 @@ class FreeBody(NamedTuple):
 
     Attributes:
         mass: [6], mass (three times, kg) and moments of inertia (kg m^2), with armature.
-        inertia: Moments of inertia without armature, kg m^2.
+        inertia: [3], moments of inertia without armature, kg m^2.
         weight: [3], force of gravity in the world, N.
-        damping: [6], damping of its degrees of freedom.
+        damping: [6], damping of its degrees of freedom, N s/m and N m s/rad.
     """
 
     mass: tuple[float, ...]
@@ -102,7 +101,7 @@ class BoxModel(NamedTuple):
     Attributes:
         tree: Hinges and slides, without contacts.
         body: The free body.
-        free_index: Index of its link, as that of a mocap body (`links.mocap_link`).
+        free_index: Mocap index that stands for its link (`links.mocap_link`): the first after those of mocap bodies.
         contacts: Contacts, with `LaneRow` for the numbers that vary.
         table: [R, 32] float64, these numbers.
         coupled: Pairs (row, column) of degrees of freedom, row >= column, that move the boxes of a common pair.
@@ -119,8 +118,9 @@ class BoxModel(NamedTuple):
 def supports(model: mjx.Model) -> bool:
     """Return True if the engine can simulate a model with boxes.
 
-    It supports models of `newton.supports` with Euler's method, one free body, the last, with no other body on it, up to eight
-    explicit contact pairs of boxes with friction, and otherwise the joints, actuators and welds of the scalar engine.
+    It supports models of `newton.supports` with Euler's method; one free body, the last, which has the frame of its inertia and
+    no children, actuators or welds; up to eight explicit contact pairs of boxes with ``condim`` 3 or 4 and impedances of
+    exponent 2; and otherwise the joints, actuators and welds of the scalar engine.
     """
     if not scalar_model.is_concrete(model) or not newton.supports(model) or not box_contacts.supports(model):
         return False
@@ -193,12 +193,12 @@ def _as_rows(part: Any, table: list[np.ndarray]) -> Any:
 def _free_body(model: mjx.Model, tree: ScalarModel) -> FreeBody:
     body = int(model.jnt_bodyid[-1])
     mass, inertia = float(np.asarray(model.body_mass)[body]), floats(np.asarray(model.body_inertia)[body])
-    armature = np.asarray(model.dof_armature)[-FREE_JOINTS:]
+    armature = np.asarray(model.dof_armature)[-FREE_DOFS:]
     return FreeBody(
         mass=floats(np.array([mass] * 3 + list(inertia)) + armature),
         inertia=inertia,
         weight=floats(mass * tree.gravity),
-        damping=floats(np.asarray(model.dof_damping)[-FREE_JOINTS:]),
+        damping=floats(np.asarray(model.dof_damping)[-FREE_DOFS:]),
     )
 
 
@@ -250,7 +250,7 @@ def _side(model: mjx.Model, frames: list[FixedFrame], geoms: np.ndarray) -> Side
 
 def _signs(model: mjx.Model, tree: ScalarModel, frames: list[FixedFrame], geoms: tuple[np.ndarray, np.ndarray]) -> tuple:
     joints, free = len(tree.links), links.mocap_link(model.nmocap)
-    moves = np.zeros((2, joints + FREE_JOINTS, LANES))
+    moves = np.zeros((2, joints + FREE_DOFS, LANES))
     for side, lane in np.ndindex(2, LANES):
         link = frames[model.geom_bodyid[geoms[side][lane]]].link
         moves[side, joints:, lane] = link == free

@@ -43,7 +43,7 @@ def simulate(
     """
     contacts: LaneContacts = with_rows(model.contacts, table)
     tree = model.tree
-    control = steps.clipped_controls(tree, control)
+    control = steps.clip_controls(tree, control)
     poses = mocap_poses(tuple(links.mocap_link(index) for index in tree.mocaps), mocap)
     inputs = StepInputs(timestep, control, applied, poses)
 
@@ -57,9 +57,9 @@ def _step(model: BoxModel, contacts: LaneContacts, state: JointState, inputs: St
     """Take one step of Euler's method, semi-implicit in the velocity and implicit in the damping."""
     tree, body, timestep = model.tree, model.body, inputs.timestep
     joints = len(tree.links)
-    place, turn = state.position[joints : joints + 3], state.position[joints + 3 :]
+    origin, quaternion = state.position[joints : joints + 3], state.position[joints + 3 :]
     free = links.mocap_link(model.free_index)
-    pose = _free_pose(place, turn)
+    pose = _free_pose(origin, quaternion)
     own = StepInputs(timestep, inputs.control, inputs.applied[:joints], {**inputs.mocap, free: pose})
     before = JointState(*(part[:joints] for part in state))
     dynamics = steps.tree_state(tree, before, own)
@@ -87,33 +87,33 @@ def _step(model: BoxModel, contacts: LaneContacts, state: JointState, inputs: St
     damped = [*solve_positive(damped_mass, pushed[:joints]), *(f / m for f, m in zip(pushed[joints:], inertias, strict=True))]
     velocity = [rate + timestep * change for rate, change in zip(state.velocity, damped, strict=True)]
     moved = [start + timestep * rate for start, rate in zip(state.position, velocity[: joints + 3], strict=False)]
-    position = [*moved, *_turned(turn, velocity[joints + 3 :], timestep)]
+    position = [*moved, *_integrate_quaternion(quaternion, velocity[joints + 3 :], timestep)]
     return JointState(position, velocity, acceleration, constraint)
 
 
-def _free_pose(place: Column, turn: Column) -> MocapPose:
-    quaternion = quaternions.normalize(turn)
-    return MocapPose(Pose((place[0], place[1], place[2]), quaternions.rotation_axes(quaternion)), quaternion)
+def _free_pose(position: Column, quaternion: Column) -> MocapPose:
+    unit_quaternion = quaternions.normalize(quaternion)
+    return MocapPose(Pose((position[0], position[1], position[2]), quaternions.rotation_axes(unit_quaternion)), unit_quaternion)
 
 
 def _free_forces(body: FreeBody, velocity: Column, applied: Column) -> Column:
     """Return the forces on the free body without constraints, in the world, and torques, about its own axes."""
-    spin = (velocity[3], velocity[4], velocity[5])
-    x, y, z = (times(inertia, rate) for inertia, rate in zip(body.inertia, spin, strict=True))
-    loads = [*body.weight, *(minus(0.0, part) for part in _gyroscopic(body, spin, (x, y, z)))]
+    omega = (velocity[3], velocity[4], velocity[5])
+    x, y, z = (times(inertia, rate) for inertia, rate in zip(body.inertia, omega, strict=True))
+    loads = [*body.weight, *(minus(0.0, part) for part in _gyroscopic(body, omega, (x, y, z)))]
     drags = [times(damping, rate) for damping, rate in zip(body.damping, velocity, strict=True)]
     return [minus(plus(load, push), drag) for load, push, drag in zip(loads, applied, drags, strict=True)]
 
 
-def _gyroscopic(body: FreeBody, spin: tuple, momentum: tuple) -> tuple:
+def _gyroscopic(body: FreeBody, omega: tuple, momentum: tuple) -> tuple:
     if len(set(body.inertia)) == 1:
         return 0.0, 0.0, 0.0
-    return cross(spin, momentum)
+    return cross(omega, momentum)
 
 
-def _turned(quaternion: Column, spin: Column, timestep: float) -> Column:
+def _integrate_quaternion(quaternion: Column, omega: Column, timestep: float) -> Column:
     """Return the quaternion a time step later, at a constant angular velocity (rad/s) about the body's own axes."""
-    axis = (spin[0], spin[1], spin[2])
+    axis = (omega[0], omega[1], omega[2])
     square = dot(axis, axis)
     norm = jnp.sqrt(square)
     inverse = 1.0 / jnp.where(norm > 0, norm, 1.0)

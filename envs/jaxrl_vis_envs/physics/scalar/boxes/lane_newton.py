@@ -1,8 +1,8 @@
 """Newton's method for constraint forces with contacts in lanes: the iterations of `physics.newton`, for one episode per warp.
 
-A scalar of the episode is the same in all lanes. What all contacts contribute to a scalar is a sum over the lanes. An iteration
-that leaves the same constraints acting as before has reached the minimum, since the cost is a parabola as long as these are the
-same; the iterations end there, and so does a line search that has converged.
+A scalar of the episode is the same in all lanes; contributions of the contacts to it are summed over the lanes. The iterations
+end when a step leaves the set of acting constraints unchanged: the cost is quadratic within a set, so the step has reached the
+minimum. A line search ends when it has converged.
 """
 
 from typing import Any, NamedTuple
@@ -52,14 +52,14 @@ class LaneProblem(NamedTuple):
 
 
 class _Residual(NamedTuple):
-    """Residuals of the rows of welds and limits, and those of the contacts' four components."""
+    """Residuals of the rows of welds and limits, and of the contacts' four components (per lane)."""
 
     rows: Column
     parts: Column
 
 
 def sum_lanes(number: Any) -> Any:
-    """Add up the lanes, the last axis; return the sum in all of them."""
+    """Sum over the lanes, the last axis, and broadcast the sum to all of them."""
     return jnp.broadcast_to(jnp.sum(number, axis=-1, keepdims=number.ndim > 1), number.shape)
 
 
@@ -109,7 +109,7 @@ def _edges(problem: LaneProblem, parts: Column) -> list[tuple[Any, Any, Any, Any
     return edges
 
 
-def _acting(problem: LaneProblem, rows: Column) -> Column:
+def _acting_stiffness(problem: LaneProblem, rows: Column) -> Column:
     """Return the stiffness of the rows of welds and limits where they act, 0 elsewhere."""
     return [
         stiffness if row < problem.equalities else jnp.where(x < 0, stiffness, 0.0)
@@ -121,7 +121,7 @@ def _cost(problem: LaneProblem, acceleration: Column) -> Any:
     residual = _residual(problem, acceleration)
     inertial = symmetric_product(problem.mass, acceleration)
     cost = 0.5 * inner(acceleration, inertial) - inner(problem.force, acceleration)
-    cost = cost + 0.5 * total(d * x * x for d, x in zip(_acting(problem, residual.rows), residual.rows, strict=True))
+    cost = cost + 0.5 * total(d * x * x for d, x in zip(_acting_stiffness(problem, residual.rows), residual.rows, strict=True))
     edges = _edges(problem, residual.parts)
     return cost + 0.5 * sum_lanes(total(d * x * x + e * y * y for x, y, d, e in edges))
 
@@ -136,7 +136,7 @@ def _constraint_slope(problem: LaneProblem, residual: _Residual) -> Column:
         sum_lanes(total(p * g for p, g in zip(pulls, parts, strict=True) if not _is_known(g)))
         for parts in problem.contacts.jacobian
     ]
-    for entries, x, stiffness in zip(problem.jacobian, residual.rows, _acting(problem, residual.rows), strict=True):
+    for entries, x, stiffness in zip(problem.jacobian, residual.rows, _acting_stiffness(problem, residual.rows), strict=True):
         for joint, entry in entries.items():
             slope[joint] = slope[joint] + entry * (stiffness * x)
     return slope
@@ -148,7 +148,7 @@ def _is_known(number: Any) -> bool:
 
 def _curvature(problem: LaneProblem, residual: _Residual) -> Matrix:
     matrix: Matrix = dict(problem.mass)
-    for entries, stiffness in zip(problem.jacobian, _acting(problem, residual.rows), strict=True):
+    for entries, stiffness in zip(problem.jacobian, _acting_stiffness(problem, residual.rows), strict=True):
         add_square(matrix, entries, stiffness)
     edges = _edges(problem, residual.parts)
     both = [one + other for *_, one, other in edges]
@@ -167,55 +167,55 @@ def _curvature(problem: LaneProblem, residual: _Residual) -> Matrix:
 
 
 def _improve(problem: LaneProblem, acceleration: Column) -> tuple[Column, Any]:
-    """Take a Newton step; return the accelerations and the number of rows that start or stop acting."""
+    """Take a Newton step; return the accelerations, and 1 if rows start or stop acting in it, else 0."""
     residual = _residual(problem, acceleration)
     inertial = [
         moved - force for moved, force in zip(symmetric_product(problem.mass, acceleration), problem.force, strict=True)
     ]
     slope = [one + other for one, other in zip(inertial, _constraint_slope(problem, residual), strict=True)]
     direction = [-part for part in solve_positive(_curvature(problem, residual), slope)]
-    along = _Residual(
+    rate = _Residual(
         [row_product(entries, direction) for entries in problem.jacobian], components(problem.contacts.jacobian, direction)
     )
-    first, second = inner(direction, inertial), inner(direction, symmetric_product(problem.mass, direction))
-    length = _line_search(problem, residual, along, first, second)
-    moved = _Residual(*([x + length * v for x, v in zip(*pair, strict=True)] for pair in zip(residual, along, strict=True)))
+    linear, quadratic = inner(direction, inertial), inner(direction, symmetric_product(problem.mass, direction))
+    length = _line_search(problem, residual, rate, linear, quadratic)
+    moved = _Residual(*([x + length * v for x, v in zip(*pair, strict=True)] for pair in zip(residual, rate, strict=True)))
     after = [start + length * part for start, part in zip(acceleration, direction, strict=True)]
     return after, _changes(problem, residual, moved)
 
 
 def _changes(problem: LaneProblem, before: _Residual, after: _Residual) -> Any:
-    """Return 1 if rows that can act start or stop acting, else 0: an int32 without lanes."""
+    """Return 1 if any row starts or stops acting between two residuals, else 0: an int32 without lanes."""
     changed: Any = 0.0
-    for old, new in zip(_acting(problem, before.rows), _acting(problem, after.rows), strict=True):
+    for old, new in zip(_acting_stiffness(problem, before.rows), _acting_stiffness(problem, after.rows), strict=True):
         changed = changed + jnp.abs(old - new)
     for old, new in zip(_edges(problem, before.parts), _edges(problem, after.parts), strict=True):
         changed = changed + jnp.abs(old[2] - new[2]) + jnp.abs(old[3] - new[3])
     return jnp.max(jnp.where(changed > 0, 1, 0))
 
 
-def _line_search(problem: LaneProblem, residual: _Residual, along: _Residual, first: Any, second: Any) -> Any:
+def _line_search(problem: LaneProblem, residual: _Residual, rate: _Residual, linear: Any, quadratic: Any) -> Any:
     """Return the step length of minimum cost, between 0 and `_MAX_STEP`, by Newton's method within a bracket.
 
     Args:
         problem: The problem.
         residual: Residuals at the start.
-        along: Their change per unit of step length.
-        first: Linear coefficient of the remaining cost, ``first * length + second * length**2 / 2``.
-        second: Quadratic coefficient, not negative.
+        rate: Their change per unit of step length.
+        linear: Linear coefficient of the remaining cost, ``linear * length + quadratic * length**2 / 2``.
+        quadratic: Quadratic coefficient, not negative.
     """
 
     def slope_at(length: Any) -> tuple[Any, Any]:
-        rows = [x + length * v for x, v in zip(residual.rows, along.rows, strict=True)]
-        parts = [x + length * v for x, v in zip(residual.parts, along.parts, strict=True)]
-        slope, curvature = first + second * length, second
-        for x, v, stiffness in zip(rows, along.rows, _acting(problem, rows), strict=True):
+        rows = [x + length * v for x, v in zip(residual.rows, rate.rows, strict=True)]
+        parts = [x + length * v for x, v in zip(residual.parts, rate.parts, strict=True)]
+        slope, curvature = linear + quadratic * length, quadratic
+        for x, v, stiffness in zip(rows, rate.rows, _acting_stiffness(problem, rows), strict=True):
             slope, curvature = slope + stiffness * x * v, curvature + stiffness * v * v
         lane_slope: Any = 0.0
         lane_curvature: Any = 0.0
-        normal = along.parts[0]
+        normal = rate.parts[0]
         for row, (ahead, back, one, other) in enumerate(_edges(problem, parts), start=1):
-            faster, slower = normal + along.parts[row], normal - along.parts[row]
+            faster, slower = normal + rate.parts[row], normal - rate.parts[row]
             lane_slope = lane_slope + one * ahead * faster + other * back * slower
             lane_curvature = lane_curvature + one * faster * faster + other * slower * slower
         return slope + sum_lanes(lane_slope), curvature + sum_lanes(lane_curvature)
@@ -233,6 +233,6 @@ def _line_search(problem: LaneProblem, residual: _Residual, along: _Residual, fi
         is_moving = jnp.abs(after - length) > _RESOLUTION * jnp.abs(length)
         return step + 1, jnp.max(jnp.where(is_moving, 1, 0)), low, high, after
 
-    zero = 0.0 * first
+    zero = 0.0 * linear
     state = (0, jnp.int32(1), zero, zero + _MAX_STEP, zero + 1.0)
     return jnp.minimum(jnp.maximum(jax.lax.while_loop(continues, narrow, state)[4], 0.0), _MAX_STEP)

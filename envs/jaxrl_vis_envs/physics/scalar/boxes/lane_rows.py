@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from jaxrl_vis_envs.physics.scalar import contacts as contact_frames
 from jaxrl_vis_envs.physics.scalar.boxes import box_faces
-from jaxrl_vis_envs.physics.scalar.boxes.box_model import FREE_JOINTS, BoxModel, LaneContacts
+from jaxrl_vis_envs.physics.scalar.boxes.box_model import FREE_DOFS, BoxModel, LaneContacts
 from jaxrl_vis_envs.physics.scalar.boxes.own_block import in_own_block
 from jaxrl_vis_envs.physics.scalar.contacts import ContactPoint
 from jaxrl_vis_envs.physics.scalar.link_frames import LinkFrames
@@ -22,7 +22,7 @@ from jaxrl_vis_envs.physics.scalar.partial_arithmetic import (
 from jaxrl_vis_envs.physics.scalar.sparse_algebra import Column
 
 COMPONENTS = 4
-"""Components of a contact: along the normal and, times their friction, the two tangents and the turn about the normal."""
+"""Number of components of a contact: normal, two tangents, and rotation about the normal; all but the first times friction."""
 
 
 class LaneRows(NamedTuple):
@@ -30,9 +30,9 @@ class LaneRows(NamedTuple):
 
     Attributes:
         jacobian: For each degree of freedom, the four components' derivatives, per lane; 0.0 where it moves no box.
-        offset: [4], what to add to a component of the acceleration to obtain its residual.
+        offset: [4], residual of each component at zero acceleration.
         stiffness: Stiffness of the rows, 0 where the boxes do not touch.
-        torsional_stiffness: The same of the two rows with the turn about the normal, 0 for contacts without its friction.
+        torsional_stiffness: Stiffness of the two rows of rotation about the normal, 0 for contacts without torsional friction.
     """
 
     jacobian: list[tuple[Any, Any, Any, Any]]
@@ -53,8 +53,8 @@ def contact_rows(model: BoxModel, contacts: LaneContacts, frames: LinkFrames, ve
     """
     zero = 0.0 * velocity[0]
     point = in_own_block(
-        lambda places: box_faces.contact_points(contacts, places),
-        box_faces.places(contacts, frames),
+        lambda poses: box_faces.contact_points(contacts, poses),
+        box_faces.moving_poses(contacts, frames),
         ContactPoint(zero, (zero,) * 3, (zero,) * 3),
     )
     directions = contact_frames.contact_axes(point.normal)
@@ -85,7 +85,9 @@ def components(jacobian: list[tuple[Any, Any, Any, Any]], column: Column) -> Col
 def _tree_jacobian(
     model: BoxModel, contacts: LaneContacts, frames: LinkFrames, point: ContactPoint, directions: tuple
 ) -> list[tuple[Any, Any, Any, Any]]:
-    """Return the derivatives of a contact's point and turn by the joints that may move it, along the three directions."""
+    """Return the derivatives of a contact with respect to each joint of the tree: of its point along the three directions, and
+    of the rotation about the normal.
+    """
     links = model.tree.links
     moving = [frame for side in contacts.sides for _, frame in side.moving if frame.link >= 0]
     if not moving:
@@ -112,14 +114,14 @@ def _tree_jacobian(
 def _free_jacobian(
     contacts: LaneContacts, frames: LinkFrames, point: ContactPoint, directions: tuple, free: int
 ) -> list[tuple[Any, Any, Any, Any]]:
-    """Return the same by the degrees of freedom of the free body: along the world's axes and about its own."""
+    """Return the same derivatives for the free body's degrees of freedom: along the world's axes, then about its own."""
     origin, axes = frames.origin_and_axes(free)
     arm = subtract(point.position, origin)
     moments: list[Vector] = [cross(arm, direction) for direction in directions]
     jacobian: list[tuple[Any, Any, Any, Any]] = [(*(direction[axis] for direction in directions), 0.0) for axis in range(3)]
     for axis in axes:
         jacobian.append((*(dot(axis, moment) for moment in moments), dot(axis, directions[0])))
-    assert len(jacobian) == FREE_JOINTS
+    assert len(jacobian) == FREE_DOFS
     return jacobian
 
 

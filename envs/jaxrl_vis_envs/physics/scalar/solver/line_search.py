@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxrl_vis_envs.physics.scalar.sparse_algebra import Column
 
 MAX_STEPS = 10
-"""Points of the line at which the slope is evaluated."""
+"""Maximum number of evaluations of the slope along a line."""
 _TOLERANCE = 1e-5  # relative change of the step length below which an episode has converged
 _UNBOUNDED = 1e30
 
@@ -31,7 +31,7 @@ def minimize_along_line(
         slope_at: Function from a step length to the cost's slope and curvature there; the slope at 0 is not positive.
         corners: Step lengths at which the curvature jumps.
         like: Scalar with the shape and dtype of the batch.
-        max_steps: Number of evaluations of ``slope_at``.
+        max_steps: Number of evaluations of ``slope_at``; with ``active``, their maximum.
         active: Inside a kernel, a mask of the episodes whose result is used: the search ends, after at least two steps, once it
             has converged for all of these. None outside of kernels; all steps are then taken.
 

@@ -82,7 +82,7 @@ def solve(problem: Problem, iterations: int, exact: Any, in_kernel: bool = False
 
     Args:
         problem: The problem.
-        iterations: Newton steps with a line search.
+        iterations: Number of Newton steps with a line search.
         exact: Take one more, full Newton step where it reduces the gradient (see `mjx_model.step`): a bool, or an int32 scalar,
             1 or 0, that is known only at run time.
         in_kernel: Generate code for a GPU kernel: loops carry intermediate values, since registers are free, and the line
@@ -124,7 +124,7 @@ class _Iterate(NamedTuple):
 
     Attributes:
         acceleration: Accelerations of the joints.
-        residual: Difference of each row from its target.
+        residual: Residual of each row: its acceleration minus the reference acceleration.
         force: Constraint forces on the joints.
         gradient: Gradient of the cost.
     """
@@ -145,12 +145,12 @@ class _NewtonSolver:
         self._separate = [row for row in range(len(problem.jacobian)) if row not in in_cones]
 
     def residual(self, acceleration: Sequence[Any]) -> Column:
-        """Return the difference of each row from its target."""
+        """Return the residual of each row: its acceleration minus the reference acceleration."""
         rows = zip(self._problem.jacobian, self._problem.target, strict=True)
         return [row_product(entries, acceleration) - target for entries, target in rows]
 
     def cost(self, acceleration: Column, residual: Column, free: Column) -> Any:
-        """Return the cost, up to a constant."""
+        """Return the cost: that of the constraints, plus the inertial cost of deviating from the unconstrained ``free``."""
         problem = self._problem
         cost: Any = 0.0
         if acceleration is not free:
@@ -269,17 +269,17 @@ class _NewtonSolver:
         """Return the step length of minimum cost; in a kernel, iterate only until it has converged where ``is_resolved``."""
         active = is_resolved if self._in_kernel else None
         problem = self._problem
-        along = [row_product(entries, direction) for entries in problem.jacobian]
-        pulling = {row: problem.stiffness[row] * along[row] for row in self._separate if self._max_friction(row) is None}
+        rate = [row_product(entries, direction) for entries in problem.jacobian]
+        pulling = {row: problem.stiffness[row] * rate[row] for row in self._separate if self._max_friction(row) is None}
         # The inertial part of the slope at the start is the gradient's less the constraints'.
-        first = total((g + f) * d for g, f, d in zip(iterate.gradient, iterate.force, direction, strict=True))
-        second = total(m * d for m, d in zip(symmetric_product(problem.mass, direction), direction, strict=True))
+        linear = total((g + f) * d for g, f, d in zip(iterate.gradient, iterate.force, direction, strict=True))
+        quadratic = total(m * d for m, d in zip(symmetric_product(problem.mass, direction), direction, strict=True))
 
         def slope_at(length: Any) -> tuple[Any, Any]:
-            slope, curvature = first + length * second, second
-            moved = [x + length * v for x, v in zip(iterate.residual, along, strict=True)]
+            slope, curvature = linear + length * quadratic, quadratic
+            moved = [x + length * v for x, v in zip(iterate.residual, rate, strict=True)]
             for row in self._separate:
-                x, v, bound, stiffness = moved[row], along[row], self._max_friction(row), problem.stiffness[row]
+                x, v, bound, stiffness = moved[row], rate[row], self._max_friction(row), problem.stiffness[row]
                 if bound is None:
                     acting = pulling[row] if row < problem.equalities else jnp.where(x < 0, pulling[row], 0.0)
                     slope, curvature = slope + acting * x, curvature + acting * v
@@ -289,24 +289,24 @@ class _NewtonSolver:
                     curvature = curvature + jnp.where(slides, 0.0, stiffness * v * v)
             for start in problem.cones:
                 cone, rows = self._cone(start, moved), self._cone_rows(start)
-                stuck_slope = total(problem.stiffness[row] * moved[row] * along[row] for row in rows)
-                stuck_curvature = total(problem.stiffness[row] * along[row] * along[row] for row in rows)
-                cone_slope, cone_curvature = cone.slope_along([along[row] for row in rows])
+                stuck_slope = total(problem.stiffness[row] * moved[row] * rate[row] for row in rows)
+                stuck_curvature = total(problem.stiffness[row] * rate[row] * rate[row] for row in rows)
+                cone_slope, cone_curvature = cone.slope_along([rate[row] for row in rows])
                 slope = slope + jnp.where(cone.is_stuck, stuck_slope, cone_slope)
                 curvature = curvature + jnp.where(cone.is_stuck, stuck_curvature, cone_curvature)
             return slope, curvature
 
         if not (problem.max_friction or problem.cones):
-            return minimize_along_line(slope_at, [], first, _SMOOTH_LINE_SEARCH_STEPS, active)
-        return minimize_along_line(slope_at, self._corners(iterate, along), first, active=active)
+            return minimize_along_line(slope_at, [], linear, _SMOOTH_LINE_SEARCH_STEPS, active)
+        return minimize_along_line(slope_at, self._corners(iterate, rate), linear, active=active)
 
-    def _corners(self, iterate: _Iterate, along: Column) -> Column:
+    def _corners(self, iterate: _Iterate, rate: Column) -> Column:
         """Return the step lengths at which rows start or stop acting, sliding or being stuck."""
         corners: Column = []
         for row in self._separate[self._problem.equalities :]:
-            x, v, bound, stiffness = iterate.residual[row], along[row], self._max_friction(row), self._problem.stiffness[row]
+            x, v, bound, stiffness = iterate.residual[row], rate[row], self._max_friction(row), self._problem.stiffness[row]
             ends = [0.0] if bound is None else [bound / stiffness, -bound / stiffness]
             corners += [safe_divide(end - x, v) for end in ends]
         for start in self._problem.cones:
-            corners += self._cone(start, iterate.residual).corners([along[row] for row in self._cone_rows(start)])
+            corners += self._cone(start, iterate.residual).corners([rate[row] for row in self._cone_rows(start)])
         return corners

@@ -13,12 +13,12 @@ from jaxrl_vis.stalks.phenotyping.io.names import readable
 from jaxrl_vis_envs.documents import parse_json, parse_xml, read_bytes, read_json, read_text
 
 _MAX_BYTES = 10_000_000  # of the annotation file of one image
-_DEPTH = 4  # levels of nested folders searched
+_MAX_DEPTH = 4  # levels of nested folders searched
 _MAX_FILES = 200_000
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm"}
 _HELD_BACK = {"valid", "val", "test", "testing", "validation"}
 """Names of folders of held-out data, skipped if there is a sibling folder ``train``."""
-_WRONG = (ValueError, KeyError, TypeError, AttributeError, OverflowError, IndexError)
+_MALFORMED = (ValueError, KeyError, TypeError, AttributeError, OverflowError, IndexError)
 """Errors raised by a reader given a file in another format."""
 
 
@@ -49,8 +49,8 @@ def _read(folder: Path) -> list[tuple[Any, Annotated]]:
     others: list[Path] = []
     names: list[str] | None = None
     numbers = itertools.count()
-    images = {image.stem: image for image in _files(folder, _IMAGES) if image.is_file()}
-    for file in _files(folder, {".json", ".xml", ".txt"}):
+    images = {image.stem: image for image in _walk_files(folder, _IMAGES) if image.is_file()}
+    for file in _walk_files(folder, {".json", ".xml", ".txt"}):
         if file.suffix.lower() == ".json":
             read = _read_json(file, numbers)
         elif file.suffix.lower() == ".xml":
@@ -80,13 +80,13 @@ def _read(folder: Path) -> list[tuple[Any, Annotated]]:
     return annotated
 
 
-def _convert_errors(file: Path, read: Any, kind: str) -> Any:
+def _convert_errors(file: Path, read: Any, format_name: str) -> Any:
     """Call ``read``, converting errors of the readers to a `RequestError`.
 
     Args:
         file: The file that it reads, for messages.
         read: Reader without arguments.
-        kind: Name of the expected format, for messages.
+        format_name: Name of the expected format, for messages.
 
     Raises:
         RequestError: The file cannot be read, or has another format.
@@ -97,8 +97,8 @@ def _convert_errors(file: Path, read: Any, kind: str) -> Any:
         raise
     except OSError as error:
         raise RequestError(f"cannot read {file}: {error.strerror or error}") from error
-    except _WRONG as error:
-        what = "not COCO: it needs images and annotations" if kind == "COCO" else f"no annotation of {kind}"
+    except _MALFORMED as error:
+        what = "not COCO: it needs images and annotations" if format_name == "COCO" else f"no annotation of {format_name}"
         raise RequestError(f"{file} is {what}{_error_reason(error)}") from error
 
 
@@ -153,7 +153,7 @@ def _class_names(folder: Path) -> list[str]:
     return []
 
 
-def _files(folder: Path, suffixes: set[str]) -> Iterator[Path]:
+def _walk_files(folder: Path, suffixes: set[str]) -> Iterator[Path]:
     """Yield the files with some suffixes in a folder and its subfolders, sorted by name, except those of held-out data.
 
     Hidden files and folders, folders called ``truth`` and unreadable folders are skipped.
@@ -177,7 +177,7 @@ def _files(folder: Path, suffixes: set[str]) -> Iterator[Path]:
                 if count > _MAX_FILES:
                     raise RequestError(f"{folder} holds more than {_MAX_FILES} files: name the folder of the annotations")
                 yield path
-        waiting += [(path, depth + 1) for path in folders if depth + 1 < _DEPTH]
+        waiting += [(path, depth + 1) for path in folders if depth + 1 < _MAX_DEPTH]
 
 
 class _Index:
@@ -187,7 +187,7 @@ class _Index:
         self._folder = folder
         self._by_name: dict[str, list[Path]] = {}
         self._taken: dict[Path, Path] = {}
-        for path in filter(Path.is_file, _files(folder, _IMAGES)):
+        for path in filter(Path.is_file, _walk_files(folder, _IMAGES)):
             self._by_name.setdefault(path.name.lower(), []).append(path)
             self._by_name.setdefault(path.stem.lower() + "\0", []).append(path)
 

@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, Annotation, from_outline, without_width
-from jaxrl_vis.stalks.phenotyping.io.image_headers import plain_png, size_in
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, Annotation, from_outline, shape_without_width
+from jaxrl_vis.stalks.phenotyping.io.image_headers import read_header_size, strip_png
 from jaxrl_vis.stalks.phenotyping.io.images import MAX_PIXELS
 from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask
 
@@ -44,7 +44,7 @@ def _shape(shape: dict[str, Any], size: tuple[int, int], source: str) -> Annotat
     if kind == "mask":
         return {"name": name, "segmentation": _mask(shape, points, size), "source": source}
     if kind not in _CORNERS:
-        return without_width(name, kind, source)
+        return shape_without_width(name, kind, source)
     if len(points) < _CORNERS[kind]:
         return {"name": name, "problem": f"is a {kind} of {len(points)} points", "source": source}
     if kind == "rectangle":
@@ -66,12 +66,12 @@ def _mask(shape: dict[str, Any], points: np.ndarray, size: tuple[int, int]) -> d
         data = base64.b64decode(shape["mask"], validate=True)
     except binascii.Error as error:
         raise ValueError("a mask that is not base64") from error
-    shown = size_in(io.BytesIO(data))
+    shown = read_header_size(io.BytesIO(data))
     if shown is None or shown[0] * shown[1] > MAX_PIXELS:
         raise ValueError("a mask that is no PNG")
     if not 0 < size[0] * size[1] <= MAX_PIXELS or min(left, top) < 0 or left + shown[1] > size[0] or top + shown[0] > size[1]:
         raise ValueError("a mask that reaches beyond its image")
-    plain = plain_png(data)
+    plain = strip_png(data)
     mask = cv2.imdecode(np.frombuffer(plain, np.uint8), cv2.IMREAD_UNCHANGED) if plain else None
     if mask is None or mask.shape != shown:
         raise ValueError("a mask that is no PNG")

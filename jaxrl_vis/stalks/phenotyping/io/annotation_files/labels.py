@@ -10,10 +10,10 @@ from jaxrl_vis.stalks.phenotyping.io.names import readable
 
 _STALKS = {"stalk", "stalks"}
 _CROPS = {"sorghum", "maize", "corn", "cane", "sugarcane", "wheat", "rice", "millet", "crop", "plant", "plants", "the", "a"}
-_SHOWN = 6
+_MAX_LISTED = 6
 
 
-def choose(annotations: list[dict[str, Any]], labels: Sequence[str], source: str) -> tuple[list[dict[str, Any]], str]:
+def select_stalks(annotations: list[dict[str, Any]], labels: Sequence[str], source: str) -> tuple[list[dict[str, Any]], str]:
     """Select the annotations whose label denotes a stalk.
 
     Args:
@@ -62,5 +62,5 @@ def _clean_name(name: Any) -> str:
 
 
 def _format_labels(names: Counter[str]) -> str:
-    parts = [f"{readable(name) or 'without a name'} ({count})" for name, count in names.most_common(_SHOWN)]
-    return ", ".join(parts) + (f" and {len(names) - _SHOWN} others" if len(names) > _SHOWN else "")
+    parts = [f"{readable(name) or 'without a name'} ({count})" for name, count in names.most_common(_MAX_LISTED)]
+    return ", ".join(parts) + (f" and {len(names) - _MAX_LISTED} others" if len(names) > _MAX_LISTED else "")

@@ -1,7 +1,6 @@
 """Common representation of annotations that the readers return, not yet validated: boxes, outlines and unusable shapes."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +28,6 @@ class Annotated:
     annotations: list[Annotation]
 
 
-Reader = Callable[[Path, Any], list[Annotated]]
-"""Convert the parsed contents of a file to images: called with the path and the contents."""
 _NO_WIDTH = "which has no width: draw it as a polygon or a rectangle"
 
 
@@ -47,13 +44,19 @@ def from_box(name: str, box: list[float], source: str, group: Any = None) -> Ann
     return {"name": name, "bbox": box, "source": source, "group": group}
 
 
-def without_width(name: str, kind: str, source: str) -> Annotation:
+def shape_without_width(name: str, shape_type: str, source: str) -> Annotation:
     """Return an unusable annotation: a shape such as a point or a line, which has no width."""
-    return {"name": name, "problem": f"is a {kind[:40]}, {_NO_WIDTH}", "source": source, "group": None}
+    return {"name": name, "problem": f"is a {shape_type[:40]}, {_NO_WIDTH}", "source": source, "group": None}
 
 
-def turned_box(centre: tuple[float, float], size: tuple[float, float], angle: float) -> np.ndarray:
-    """Return the corners [4, 2] of a box (width, height) rotated clockwise about its centre by ``angle``, radians."""
+def rotated_box(centre: tuple[float, float], size: tuple[float, float], angle: float) -> np.ndarray:
+    """Return the corners [4, 2] of a box, rotated about its centre.
+
+    Args:
+        centre: x and y of the centre, pixels.
+        size: Width and height, pixels.
+        angle: Angle of rotation, rad, clockwise in an image whose y axis points down.
+    """
     across, down = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     half = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * size
     return np.array(centre) + half[:, :1] * across + half[:, 1:] * down
@@ -63,6 +66,9 @@ def merge_groups(annotations: list[Annotation]) -> list[Annotation]:
     """Merge polygons with the same name and group into one annotation: the visible parts of a partially occluded object.
 
     Modifies the annotations in place: ``group`` is removed, and the ``bbox`` of merged ones is None.
+
+    Returns:
+        The annotations, without those that were merged into an earlier one.
     """
     joined: dict[tuple[str, Any], Annotation] = {}
     result = []

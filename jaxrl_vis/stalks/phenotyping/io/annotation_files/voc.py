@@ -11,8 +11,8 @@ from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import (
     Annotation,
     from_box,
     from_outline,
-    turned_box,
-    without_width,
+    rotated_box,
+    shape_without_width,
 )
 from jaxrl_vis.stalks.phenotyping.io.images import MAX_PIXELS
 from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask
@@ -52,7 +52,7 @@ def _voc_image(path: Path, root: Element) -> Annotated:
             x, y, wide, high, angle = (float(_text(element, f"robndbox/{part}")) for part in ("cx", "cy", "w", "h", "angle"))
             if not np.isfinite([x, y, wide, high, angle]).all():
                 raise ValueError("robndbox")
-            annotations.append(from_outline(name, turned_box((x, y), (wide, high), angle), source))
+            annotations.append(from_outline(name, rotated_box((x, y), (wide, high), angle), source))
         else:
             # Pixel indices start at 1, and the last ones are inclusive.
             left, top, right, bottom = (float(_text(element, f"bndbox/{edge}")) for edge in _EDGES)
@@ -90,7 +90,7 @@ def _cvat_shape(shape: Element, size: tuple[int, int], name: str, source: str, g
         angle = np.radians(float(shape.get("rotation") or 0.0))
         if angle:
             centre = ((left + right) / 2, (top + bottom) / 2)
-            return from_outline(name, turned_box(centre, (right - left, bottom - top), float(angle)), source, group)
+            return from_outline(name, rotated_box(centre, (right - left, bottom - top), float(angle)), source, group)
         return from_box(name, [left, top, right - left, bottom - top], source, group)
     if shape.tag == "polygon":
         points = [list(map(float, point.split(","))) for point in (shape.get("points") or "").split(";") if point]
@@ -102,7 +102,7 @@ def _cvat_shape(shape: Element, size: tuple[int, int], name: str, source: str, g
             "segmentation": _cvat_mask(shape.get("rle") or "", (left, top, wide, high), size),
             "source": source,
         }
-    return without_width(name, str(shape.tag), source)
+    return shape_without_width(name, str(shape.tag), source)
 
 
 def _cvat_mask(runs: str, box: tuple[int, int, int, int], size: tuple[int, int]) -> dict[str, Any]:

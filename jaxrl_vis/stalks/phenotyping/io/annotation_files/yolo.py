@@ -40,7 +40,7 @@ def read_names(path: Path) -> list[str]:
 
 
 def is_yolo(text: str) -> bool:
-    """Return whether a text is in YOLO format: lines of at least five words, the first of which is a class number."""
+    """Return True if a text is in YOLO format: lines of at least five words, the first of which is a class number, or none."""
     lines = [line.split() for line in text.splitlines() if line.strip()]
     return all(len(words) >= 5 and re.fullmatch(r"\d{1,4}", words[0]) is not None for words in lines)
 
@@ -52,10 +52,10 @@ def read_yolo(path: Path, text: str, names: list[str], size: tuple[int, int]) ->
         path: The file, for messages.
         text: Its contents.
         names: Names of the classes; the number of a class is its name if it is not listed.
-        size: Width and height of the image.
+        size: Width and height of the image, pixels.
 
     Raises:
-        ValueError: A line is not in YOLO format, or has coordinates outside the image.
+        ValueError: A line is not in YOLO format, or has coordinates more than 2 % outside the image.
     """
     annotations = []
     for index, words in enumerate(line.split() for line in text.splitlines() if line.strip()):

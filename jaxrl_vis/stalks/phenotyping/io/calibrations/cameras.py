@@ -57,7 +57,7 @@ class UnrectifiedPair:
     unit: Unit | None
     program: str
 
-    def if_rectified(self) -> RectifiedPair | None:
+    def to_rectified(self) -> RectifiedPair | None:
         """Return the projection matrices if the cameras are rectified as mounted; None otherwise.
 
         They are if they have no distortion, equal focal lengths, no rotation, and a translation along x only.
@@ -79,12 +79,18 @@ def camera_matrix(focal_x: float, focal_y: float, x: float, y: float) -> np.ndar
     return np.array([[focal_x, 0.0, x], [0.0, focal_y, y], [0.0, 0.0, 1.0]])
 
 
-def projection(focal: float, x: float, y: float, shift: float = 0.0) -> np.ndarray:
-    """Return the projection matrix [3, 4] float64 of a rectified camera; ``shift`` is minus the focal length times baseline."""
+def projection_matrix(focal: float, x: float, y: float, shift: float = 0.0) -> np.ndarray:
+    """Return the projection matrix [3, 4] float64 of a rectified camera.
+
+    Args:
+        focal: Focal length, pixels.
+        x, y: Principal point, pixels.
+        shift: For the right camera, minus the focal length times the baseline, in pixels times the unit of the baseline.
+    """
     return np.array([[focal, 0.0, x, shift], [0.0, focal, y, 0.0], [0.0, 0.0, 1.0, 0.0]])
 
 
-def numbers(value: Any, count: int) -> np.ndarray | None:
+def parse_array(value: Any, count: int) -> np.ndarray | None:
     """Convert a list, nested list, or table with ``data`` to float64 [count]; None unless it holds ``count`` finite floats."""
     data = value.get("data") if isinstance(value, dict) else value
     rows = data if isinstance(data, list) else []
@@ -94,7 +100,7 @@ def numbers(value: Any, count: int) -> np.ndarray | None:
     return np.array(flat)
 
 
-def named_size(store: Mapping[str, Any], path: Path) -> Size | None:
+def read_size(store: Mapping[str, Any], path: Path) -> Size | None:
     """Return the image size under any of the names that programs use; None if there is none.
 
     Args:
@@ -107,16 +113,16 @@ def named_size(store: Mapping[str, Any], path: Path) -> Size | None:
     for names in (("image_width", "image_height"), ("width", "height")):
         values = [store.get(name) for name in names]
         if None not in values:
-            return image_size(values, path, " and ".join(names))
+            return check_image_size(values, path, " and ".join(names))
     for name in ("image_size", "imageSize", "resolution"):
         value = store.get(name)
         data = value.get("data") if isinstance(value, dict) else value
         if isinstance(data, list) and len(data) == 2:
-            return image_size(data, path, name)
+            return check_image_size(data, path, name)
     return None
 
 
-def image_size(values: list[Any], path: Path, names: str) -> Size:
+def check_image_size(values: list[Any], path: Path, names: str) -> Size:
     """Convert a width and height to integers.
 
     Args:
@@ -132,7 +138,7 @@ def image_size(values: list[Any], path: Path, names: str) -> Size:
     return int(values[0]), int(values[1])
 
 
-def plain_numbers(text: str) -> list[float]:
+def parse_numbers(text: str) -> list[float]:
     """Parse numbers separated by white space or commas.
 
     Raises:

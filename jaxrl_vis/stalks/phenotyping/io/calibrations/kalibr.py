@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import UnrectifiedPair, camera_matrix, named_size, numbers
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import UnrectifiedPair, camera_matrix, parse_array, read_size
 
 _MODELS = {"radtan": False, "plumb_bob": False, "equidistant": True, "none": False}
 
@@ -37,15 +37,15 @@ def read_chain(store: dict[str, Any], path: Path) -> UnrectifiedPair:
             raise RequestError(
                 f"{path}: {name} has the model {str(model)[:30]}-{str(lens)[:30]}: calibrate with pinhole-radtan"
             )
-        values, bent = numbers(camera.get("intrinsics"), 4), numbers(camera.get("distortion_coeffs"), 4)
+        values, bent = parse_array(camera.get("intrinsics"), 4), parse_array(camera.get("distortion_coeffs"), 4)
         if values is None or (bent is None and lens != "none"):
             raise RequestError(f"{path}: {name} needs 4 intrinsics and 4 distortion_coeffs")
         matrices.append(camera_matrix(*values))
         distortions.append(np.zeros(4) if bent is None else bent)
-        sizes.append(named_size(camera, path))
+        sizes.append(read_size(camera, path))
         fisheye.append(_MODELS[lens])
     assert isinstance(cameras[1], dict)
-    pose = numbers(cameras[1].get("T_cn_cnm1"), 16)
+    pose = parse_array(cameras[1].get("T_cn_cnm1"), 16)
     if pose is None:
         raise RequestError(f"{path}: cam1 needs T_cn_cnm1, 4 x 4 numbers: calibrate both cameras together")
     if sizes[0] != sizes[1] or fisheye[0] != fisheye[1]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Size, image_size, plain_numbers
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Size, check_image_size, parse_numbers
 
 # Two or more numbers without brackets: a list in brackets or a single number is YAML.
 _LINE = re.compile(r"^(P|P_rect_0|S_rect_0)([0-3]):[ \t]*([-+.\d]\S*[ \t]+\S.*)$", re.MULTILINE)
@@ -36,11 +36,11 @@ def read_kitti(text: str, path: Path, image: Path | None) -> RectifiedPair:
     sizes: dict[int, Size] = {}
     for name, number, rest in _LINE.findall(text):
         try:
-            values = plain_numbers(rest)
+            values = parse_numbers(rest)
         except ValueError as error:
             raise RequestError(f"{path}: {name}{number} holds something that is no number") from error
         if name == "S_rect_0":
-            sizes[int(number)] = image_size((values + [0.0, 0.0])[:2], path, f"{name}{number}")
+            sizes[int(number)] = check_image_size((values + [0.0, 0.0])[:2], path, f"{name}{number}")
         elif len(values) != 12:
             raise RequestError(f"{path}: {name}{number} must be 3 x 4 numbers")
         else:

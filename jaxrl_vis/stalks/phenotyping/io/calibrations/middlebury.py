@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, image_size, plain_numbers
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, check_image_size, parse_numbers
 
 _LINE = re.compile(r"^\s*([A-Za-z]\w*)\s*=\s*(.*?)\s*$", re.MULTILINE)
 
@@ -28,9 +28,9 @@ def read_middlebury(text: str, path: Path) -> RectifiedPair:
     """
     values = dict(_LINE.findall(text))
     try:
-        cameras = [np.reshape(plain_numbers(values[name].strip("[]").replace(";", " ")), (3, 3)) for name in ("cam0", "cam1")]
+        cameras = [np.reshape(parse_numbers(values[name].strip("[]").replace(";", " ")), (3, 3)) for name in ("cam0", "cam1")]
         baseline, doffs = float(values["baseline"]), float(values["doffs"])
-        size = image_size([float(values["width"]), float(values["height"])], path, "width and height")
+        size = check_image_size([float(values["width"]), float(values["height"])], path, "width and height")
     except (KeyError, ValueError) as error:
         raise RequestError(
             f"{path} is a calib.txt of Middlebury, but cam0, cam1, doffs, baseline, width or height is missing or no number"

@@ -10,7 +10,7 @@ from typing import Any, get_args
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Unit, UnrectifiedPair, named_size, numbers
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Unit, UnrectifiedPair, parse_array, read_size
 
 _MATRICES = (("M1", "M2"), ("K1", "K2"), ("cameraMatrix1", "cameraMatrix2"), ("camera_matrix_1", "camera_matrix_2"))
 _DISTORTIONS = (("D1", "D2"), ("distCoeffs1", "distCoeffs2"), ("dist_coeffs_1", "dist_coeffs_2"))
@@ -31,11 +31,11 @@ def read_projections(store: dict[str, Any], path: Path) -> RectifiedPair:
     for name, side in (("P1", "left"), ("P2", "right")):
         if store.get(name) is None:
             raise RequestError(f"{path} has no projection matrix of the {side} camera ({name}): rectify the pair first")
-        matrix = numbers(store[name], 12)
+        matrix = parse_array(store[name], 12)
         if matrix is None:
             raise RequestError(f"{path}: {name} of the {side} camera must be 3 x 4 numbers")
         matrices.append(matrix.reshape(3, 4))
-    return RectifiedPair(matrices[0], matrices[1], named_size(store, path), _unit(store, path))
+    return RectifiedPair(matrices[0], matrices[1], read_size(store, path), _unit(store, path))
 
 
 def read_raw(store: dict[str, Any], path: Path) -> UnrectifiedPair | None:
@@ -48,9 +48,9 @@ def read_raw(store: dict[str, Any], path: Path) -> UnrectifiedPair | None:
     Raises:
         RequestError: The image size or unit is invalid.
     """
-    matrices = [numbers(store.get(name), 9) for name in _present(store, _MATRICES)]
+    matrices = [parse_array(store.get(name), 9) for name in _present(store, _MATRICES)]
     distortions = [_coefficients(store.get(name)) for name in _present(store, _DISTORTIONS)]
-    rotation, translation = numbers(store.get("R"), 9), numbers(store.get("T"), 3)
+    rotation, translation = parse_array(store.get("R"), 9), parse_array(store.get("T"), 3)
     if len(matrices) < 2 or matrices[0] is None or matrices[1] is None or rotation is None or translation is None:
         return None
     width = max([coefficients.size for coefficients in distortions], default=0)
@@ -58,7 +58,7 @@ def read_raw(store: dict[str, Any], path: Path) -> UnrectifiedPair | None:
     for row, coefficients in zip(padded, distortions):
         row[: coefficients.size] = coefficients
     both = np.stack([matrices[0], matrices[1]]).reshape(2, 3, 3)
-    size, unit = named_size(store, path), _unit(store, path)
+    size, unit = read_size(store, path), _unit(store, path)
     return UnrectifiedPair(both, padded, False, rotation.reshape(3, 3), translation, size, unit, "OpenCV")
 
 
@@ -69,7 +69,7 @@ def _present(store: dict[str, Any], pairs: tuple[tuple[str, str], ...]) -> tuple
 def _coefficients(value: Any) -> np.ndarray:
     data = value.get("data") if isinstance(value, dict) else value
     for count in (4, 5, 8, 12, _MAX_COEFFICIENTS):
-        values = numbers(data, count)
+        values = parse_array(data, count)
         if values is not None:
             return values
     return np.zeros(0)

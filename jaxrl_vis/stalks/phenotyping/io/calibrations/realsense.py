@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Size, image_size, projection
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Size, check_image_size, projection_matrix
 
 _MODES = 64
 
 
-def is_table(store: dict[str, Any]) -> bool:
+def is_calibration_table(store: dict[str, Any]) -> bool:
     """Return whether parsed JSON is a RealSense calibration table."""
     return "baseline" in store and any(name.startswith(("rectified.", "intrinsic_left.")) for name in store)
 
@@ -34,7 +34,7 @@ def read_table(store: dict[str, Any], path: Path, size: Size | None) -> Rectifie
         values = [_number(store.get(f"rectified.{mode}.{name}")) for name in ("width", "height", "fx", "ppx", "ppy")]
         if None not in values and all(value and value > 0 for value in values[:3]):
             wide, high, focal, x, y = (value or 0.0 for value in values)
-            modes.setdefault(image_size([wide, high], path, f"width and height of rectified.{mode}"), (focal, x, y))
+            modes.setdefault(check_image_size([wide, high], path, f"width and height of rectified.{mode}"), (focal, x, y))
     if not modes:
         raise RequestError(
             f"{path} is of a RealSense camera, but holds no rectified.0.fx and so on: export the whole calibration table"
@@ -48,7 +48,7 @@ def read_table(store: dict[str, Any], path: Path, size: Size | None) -> Rectifie
     baseline = _number(store["baseline"])
     if baseline is None:
         raise RequestError(f"{path} is of a RealSense camera, but its baseline is no number")
-    return RectifiedPair(projection(focal, x, y), projection(focal, x, y, -focal * abs(baseline)), size, "mm")
+    return RectifiedPair(projection_matrix(focal, x, y), projection_matrix(focal, x, y, -focal * abs(baseline)), size, "mm")
 
 
 def _number(value: Any) -> float | None:

@@ -9,7 +9,7 @@ from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, 
 from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
 from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import readable
-from jaxrl_vis.stalks.phenotyping.io.naming.sides import partners
+from jaxrl_vis.stalks.phenotyping.io.naming.sides import partner_names
 from jaxrl_vis_envs.documents import read_text
 
 _MAX_BYTES = 2_000_000  # of a file
@@ -41,9 +41,9 @@ def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | Unrec
         return cameras
     if len(cameras) == 2:
         return ros.read_pair(cameras, [path, path], path)
-    pair = both_sides(path)
+    pair = find_side_files(path)
     if pair is None:
-        other = next((name for _, name in partners(path.stem)), None)
+        other = next((name for _, name in partner_names(path.stem)), None)
         if other is None:
             raise RequestError(
                 f"{path} is of one camera: put the files of both into a folder, as left and right, and name that"
@@ -54,12 +54,12 @@ def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | Unrec
     return _read_sides(pair, path, image)
 
 
-def files_in(folder: Path) -> list[Path]:
+def calibration_files(folder: Path) -> list[Path]:
     """Return the files of a folder whose suffix is that of a calibration, sorted."""
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file())
 
 
-def named_pair(files: list[Path]) -> Path | None:
+def find_pair_file(files: list[Path]) -> Path | None:
     """Return the file named as the calibration of a pair, or else a .conf file of ZED; None if there is none."""
     stems = {path: path.stem.lower() for path in files}
     zed_files = [path for path in files if path.suffix.lower() == ".conf"]
@@ -71,14 +71,14 @@ def named_pair(files: list[Path]) -> Path | None:
 
 
 def _find_in_folder(folder: Path, image: Path | None) -> RectifiedPair | UnrectifiedPair:
-    files = files_in(folder)
-    pairs = {pair for pair in map(both_sides, files) if pair is not None}
+    files = calibration_files(folder)
+    pairs = {pair for pair in map(find_side_files, files) if pair is not None}
     if len(pairs) == 1:
         return _read_sides(pairs.pop(), folder, image)
     if len(pairs) > 1:
         names = " and ".join(readable(left.name) for left, _ in sorted(pairs))
         raise RequestError(f"{folder} holds several pairs of calibrations, of {names}: name one of the files")
-    alone = named_pair(files) or (files[0] if len(files) == 1 else None)
+    alone = find_pair_file(files) or (files[0] if len(files) == 1 else None)
     if alone is None:
         raise RequestError(
             f"there is no calibration {folder / 'left.yaml'}: name a file of a pair, or a folder with left.yaml and right.yaml"
@@ -86,13 +86,13 @@ def _find_in_folder(folder: Path, image: Path | None) -> RectifiedPair | Unrecti
     return read_cameras(alone, image)
 
 
-def both_sides(path: Path) -> tuple[Path, Path] | None:
+def find_side_files(path: Path) -> tuple[Path, Path] | None:
     """Return the files of the left and the right camera, one of which is ``path``; None if there is no matching other file."""
     try:
         there = {file.name.lower(): file for file in path.parent.iterdir()}
     except OSError:
         return None
-    for side, name in partners(path.stem):
+    for side, name in partner_names(path.stem):
         other = there.get(f"{name}{path.suffix}".lower())
         if other is not None and other.is_file() and other != path:
             return (path, other) if side == "left" else (other, path)
@@ -125,15 +125,15 @@ def _read(path: Path, image: Path | None) -> RectifiedPair | UnrectifiedPair | l
             return kitti.read_kitti(text, path, image)
         if zed.is_settings(text):
             return zed.read_settings(text, path, _size(image))
-        cameras = ros.from_sections(text)
+        cameras = ros.parse_ini(text)
         if cameras is not None:
             if not 1 <= len(cameras) <= 2:
                 raise RequestError(f"{path} holds {len(cameras)} cameras with a projection: name a file of one or of a pair")
             return cameras
-        printed = ros.from_print(text) or ros.from_table(text)
+        printed = ros.parse_printed(text) or ros.parse_csv(text)
         if printed is not None:
             return [printed]
-        store = parse_storage(ros.message(text))
+        store = parse_storage(ros.strip_preamble(text))
     except RequestError:
         raise
     except OSError as error:
@@ -155,10 +155,10 @@ def _read_store(store: Any, path: Path, image: Path | None) -> RectifiedPair | U
         return opencv.read_projections(store, path)
     if kalibr.is_chain(store):
         return kalibr.read_chain(store, path)
-    both = ros.both_in_one(store)
+    both = ros.split_pair(store)
     if both is not None:
         return both
-    if realsense.is_table(store):
+    if realsense.is_calibration_table(store):
         return realsense.read_table(store, path, _size(image))
     if ros.is_camera(store):
         return [store]

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Size, named_size, numbers, plain_numbers
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Size, parse_array, parse_numbers, read_size
 
 _MATRIX_NAMES = ("projection_matrix", "P", "p")
 _SIDES = (("left", "right"), ("LEFT", "RIGHT"), ("Left", "Right"), ("cam0", "cam1"))
@@ -48,8 +48,8 @@ def read_pair(stores: list[dict[str, Any]], files: list[Path], path: Path) -> Re
     return RectifiedPair(left, right, size or other, "m" if any("header" in store for store in stores) else None)
 
 
-def message(text: str) -> str:
-    """Remove everything that programs print before the first message."""
+def strip_preamble(text: str) -> str:
+    """Return a text without everything that programs print before the first message (``header:``)."""
     match = _HEADER.search(text)
     return text if match is None else text[match.start() :]
 
@@ -59,7 +59,7 @@ def is_camera(store: dict[str, Any]) -> bool:
     return any(store.get(name) is not None for name in _MATRIX_NAMES)
 
 
-def both_in_one(store: dict[str, Any]) -> list[dict[str, Any]] | None:
+def split_pair(store: dict[str, Any]) -> list[dict[str, Any]] | None:
     """Return both cameras of a file with a table for each, or with ``LEFT.P`` and ``RIGHT.P`` as in ORB-SLAM; else None."""
     for left, right in _SIDES:
         cameras = [store.get(left), store.get(right)]
@@ -75,7 +75,7 @@ def _lines_with_prefix(store: dict[str, Any], prefix: str) -> dict[str, Any]:
     return {name.removeprefix(prefix): value for name, value in store.items() if name.startswith(prefix)}
 
 
-def from_print(text: str) -> dict[str, Any] | None:
+def parse_printed(text: str) -> dict[str, Any] | None:
     """Parse a message printed by Python; return None if the text is not one.
 
     Raises:
@@ -88,11 +88,11 @@ def from_print(text: str) -> dict[str, Any] | None:
     binning: dict[str, float] = {}
     for name, value in _PRINTED_NUMBER.findall(text[matrix.end() :]):
         (binning if name.startswith("binning") else region).setdefault(name, float(value))
-    info = {"header": {}, "height": float(size[1]), "width": float(size[2]), "p": plain_numbers(matrix[1])}
+    info = {"header": {}, "height": float(size[1]), "width": float(size[2]), "p": parse_numbers(matrix[1])}
     return {**info, **binning, "roi": region}
 
 
-def from_table(text: str) -> dict[str, Any] | None:
+def parse_csv(text: str) -> dict[str, Any] | None:
     """Parse a message printed as CSV, with column names (ROS 1) or without (ROS 2); return None if the text is not one.
 
     Raises:
@@ -122,7 +122,7 @@ def from_table(text: str) -> dict[str, Any] | None:
     return None
 
 
-def from_sections(text: str) -> list[dict[str, Any]] | None:
+def parse_ini(text: str) -> list[dict[str, Any]] | None:
     """Parse the cameras of a file in the calibrator's older format (oST); return None if the text is not one.
 
     Raises:
@@ -145,9 +145,9 @@ def from_sections(text: str) -> list[dict[str, Any]] | None:
     cameras = []
     for title, values in sections:
         if title == "image":
-            size = {f"image_{side}": (plain_numbers(values.get(side, "")) or [None])[0] for side in ("width", "height")}
+            size = {f"image_{side}": (parse_numbers(values.get(side, "")) or [None])[0] for side in ("width", "height")}
         elif "projection" in values:
-            cameras.append({**size, "camera_name": title, "projection_matrix": plain_numbers(values["projection"])})
+            cameras.append({**size, "camera_name": title, "projection_matrix": parse_numbers(values["projection"])})
     return cameras
 
 
@@ -167,13 +167,13 @@ def _camera(store: dict[str, Any], path: Path, side: str) -> tuple[np.ndarray, S
         raise RequestError(
             f"{path} has no projection matrix of the {side} camera ({' or '.join(_MATRIX_NAMES)}): rectify the pair first"
         )
-    matrix = numbers(store[name], 12)
+    matrix = parse_array(store[name], 12)
     if matrix is None:
         raise RequestError(f"{path}: {name} of the {side} camera must be 3 x 4 numbers")
     matrix = matrix.reshape(3, 4)
     if not matrix.any():
         raise RequestError(f"{path} is of a camera that was never calibrated (its {name} is all 0): calibrate the pair")
-    size = named_size(store, path)
+    size = read_size(store, path)
     if size is None:
         return matrix, None
     roi = store.get("roi")

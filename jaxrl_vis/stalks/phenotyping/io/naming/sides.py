@@ -14,7 +14,7 @@ _NUMBER_IN_FILES = re.compile(_CAMERAS.format(""), re.IGNORECASE)  # image_0 and
 _OTHER = {"left": "right", "right": "left", "l": "r", "r": "l"}
 
 
-def partners(name: str, files: bool = False) -> Iterator[tuple[Side, str]]:
+def partner_names(name: str, files: bool = False) -> Iterator[tuple[Side, str]]:
     """Yield the possible sides of a name, each with the corresponding name of the other camera; the most likely first.
 
     Args:

@@ -10,7 +10,7 @@ _SPLIT = re.compile(r"(?:^|[^\d.])(\d{10})[_-](\d{9})$")  # seconds and nanoseco
 _UNIT_BY_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
 
 
-def seconds_in(stem: str) -> float | None:
+def parse_timestamp(stem: str) -> float | None:
     """Return the time in s at the end of a file name's stem; None if there is none.
 
     A float64 resolves 0.2 microseconds of seconds since 1970.
@@ -25,7 +25,7 @@ def seconds_in(stem: str) -> float | None:
     return None if stamp is None else int(stamp[1]) * _UNIT_BY_DIGITS[len(stamp[1])]
 
 
-def nearest(left: Mapping[str, float], right: Mapping[str, float]) -> dict[str, str]:
+def match_nearest(left: Mapping[str, float], right: Mapping[str, float]) -> dict[str, str]:
     """Match left to right names by time: mutual nearest neighbours, at most half the median interval apart.
 
     Args:
@@ -36,7 +36,7 @@ def nearest(left: Mapping[str, float], right: Mapping[str, float]) -> dict[str, 
     """
     if not left or not right:
         return {}
-    reach = min(_interval(list(times.values())) for times in (left, right)) / 2
+    reach = min(_median_interval(list(times.values())) for times in (left, right)) / 2
     there = _find_nearest(left, right)
     back = _find_nearest(right, left)
     return {name: other for name, other in there.items() if back[other] == name and abs(left[name] - right[other]) <= reach}
@@ -52,7 +52,7 @@ def _find_nearest(names: Mapping[str, float], others: Mapping[str, float]) -> di
     return matched
 
 
-def _interval(times: list[float]) -> float:
+def _median_interval(times: list[float]) -> float:
     """Return the median interval between images, s; 0.1 s if there is only one."""
     ordered = sorted(times)
     return statistics.median(b - a for a, b in zip(ordered, ordered[1:])) if len(ordered) > 1 else 0.1

@@ -28,7 +28,7 @@ def read_table_text(path: Path, max_bytes: int) -> str:
         raise RequestError(f"{path} is no table: save it as CSV in UTF-8 ({error})") from error
 
 
-def cells(path: Path, text: str) -> tuple[list[str], list[tuple[int, list[str]]], bool]:
+def split_cells(path: Path, text: str) -> tuple[list[str], list[tuple[int, list[str]]], bool]:
     """Split a table into cells.
 
     Lines that begin with ``#`` before the table are skipped, except one that names the columns.

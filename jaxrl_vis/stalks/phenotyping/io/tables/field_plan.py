@@ -7,7 +7,7 @@ from pathlib import Path
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.spreadsheets import unescape_cell
 from jaxrl_vis.stalks.phenotyping.io.names import readable
-from jaxrl_vis.stalks.phenotyping.io.tables.cells import cells, read_table_text
+from jaxrl_vis.stalks.phenotyping.io.tables.cells import read_table_text, split_cells
 
 _MAX_BYTES = 50_000_000
 _IDS = (
@@ -26,7 +26,7 @@ _IDS = (
     "plotnumber",
 )
 """Lower-case names of columns that may identify plots; the one that matches the most plots is used, the first of equals."""
-_SHOWN = 3
+_MAX_LISTED = 3
 _OBSERVED = {"trait", "uservalue", "value", "timetaken", "time_taken", "person", "location", "number", "rep_number", "photo"}
 """Columns of Field Book's export (one observation per row) that do not describe the plot."""
 
@@ -41,13 +41,13 @@ def read_field_plan(path: Path, plots: Sequence[str]) -> tuple[list[str], dict[s
             column in them.
 
     Returns:
-        Names of the columns in order, without the identifier; and the values in them, by plot. Plots that are not in the table
-        are missing.
+        Names of the columns in order, without the identifier and those of single observations in Field Book; and the values in
+        them, by plot, "" where a plot has none. Plots that are not in the table are missing.
 
     Raises:
         RequestError: The table cannot be read, names none of the plots, or has contradictory rows for one.
     """
-    columns, rows, _ = cells(path, read_table_text(path, _MAX_BYTES))
+    columns, rows, _ = split_cells(path, read_table_text(path, _MAX_BYTES))
     small = [name.lower().replace(" ", "_") for name in columns]
     ids = [small.index(name) for name in _IDS if name in small]
     if not columns or len(set(small)) < len(small):
@@ -84,7 +84,7 @@ def _match_names(names: Sequence[str], plots: Sequence[str]) -> dict[str, list[i
         names: Identifier in each row.
         plots: Names of the plots.
     """
-    for normalise in (str, _last_component, _number):
+    for normalise in (str, _last_component, _digits):
         rows: dict[str, list[int]] = {}
         for number, name in enumerate(names):
             if name and normalise(name):
@@ -99,7 +99,7 @@ def _last_component(name: str) -> str:
     return re.split(r"[/\\]", name)[-1].casefold()
 
 
-def _number(name: str) -> str:
+def _digits(name: str) -> str:
     """Return the last number in a plot's name, without leading zeros; empty if there is none."""
     numbers = re.findall(r"\d+", _last_component(name))
     return str(int(numbers[-1])) if numbers and len(numbers[-1]) < 20 else ""
@@ -112,7 +112,7 @@ def _match_by_range(columns: Sequence[str], table: Sequence[Sequence[str]], plot
     if "range" not in places or not across:
         return {}
     rows = {
-        (_number(row[places["range"]]), other, _number(row[places[other]])): [number]
+        (_digits(row[places["range"]]), other, _digits(row[places[other]])): [number]
         for number, row in enumerate(table)
         for other in across
     }
@@ -127,11 +127,11 @@ def _match_by_range(columns: Sequence[str], table: Sequence[Sequence[str]], plot
 
 
 def _no_plot_message(path: Path, columns: Sequence[str], names: Sequence[str], plots: Sequence[str]) -> str:
-    own = ", ".join(map(readable, plots[:_SHOWN]))
+    own = ", ".join(map(readable, plots[:_MAX_LISTED]))
     if not columns:
         return f"{path} names no plots: it needs a column plot_id (or plot, or range and row) with names as {own}"
     theirs = ", ".join(dict.fromkeys(readable(name)[:40] for name in names if name)) or "nothing"
-    theirs = ", ".join(theirs.split(", ")[:_SHOWN])
+    theirs = ", ".join(theirs.split(", ")[:_MAX_LISTED])
     return f"{path} names no plot of these: its {columns[0]} has {theirs}, and the folders are {own}"
 
 
@@ -140,5 +140,5 @@ def missing_plots(plan: Mapping[str, object], plots: Sequence[str]) -> str | Non
     missing = [readable(plot) for plot in plots if plot not in plan]
     if not missing:
         return None
-    others = f" and {len(missing) - _SHOWN} others" if len(missing) > _SHOWN else ""
-    return f"the plan of the field does not name {', '.join(missing[:_SHOWN])}{others}"
+    others = f" and {len(missing) - _MAX_LISTED} others" if len(missing) > _MAX_LISTED else ""
+    return f"the plan of the field does not name {', '.join(missing[:_MAX_LISTED])}{others}"

@@ -17,8 +17,8 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.spreadsheets import unescape_cell
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.names import readable
-from jaxrl_vis.stalks.phenotyping.io.naming.stamps import seconds_in
-from jaxrl_vis.stalks.phenotyping.io.tables.cells import cells, read_table_text
+from jaxrl_vis.stalks.phenotyping.io.naming.stamps import parse_timestamp
+from jaxrl_vis.stalks.phenotyping.io.tables.cells import read_table_text, split_cells
 
 _MAX_ODOMETRY = 8_000_000  # bytes
 _NAMES = tuple(f"{stem}{end}" for stem in ("odometry", "odom", "gps") for end in (".csv", ".tsv", ".txt", ".yaml"))
@@ -39,7 +39,7 @@ _POSITIONS = (
     ("x", "y", "z"),
 )
 _GLOBE = (("latitude", "longitude"), ("lat", "lon"), ("lat", "lng"), ("field.latitude", "field.longitude"))
-_EARTH = 6_371_000.0  # m, radius
+_EARTH_RADIUS = 6_371_000.0  # m, radius
 _MAX_SECONDS = 1e11  # maximum of time_s: larger numbers are in another unit
 _NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
 _PRINTED_STAMP = re.compile(r"\bsecs?: *(\d{1,12})\s+n(?:ano)?secs?: *(\d{1,9})\b")
@@ -164,7 +164,7 @@ def _distances_by_time(plot: PlotFolder, table: _Table, values: np.ndarray) -> d
 
     Images more than the median interval before the first or after the last row are left out.
     """
-    taken = {pair.name: seconds_in(readable(pair.left.stem)) for pair in plot.pairs if pair.left}
+    taken = {pair.name: parse_timestamp(readable(pair.left.stem)) for pair in plot.pairs if pair.left}
     times = table.times
     if times is None or len(times) < 2 or (np.diff(times) < 0).any() or not taken or None in taken.values():
         return None
@@ -214,7 +214,7 @@ def _parse_table(path: Path, text: str) -> _Table:
     Raises:
         RequestError: A column or a number is missing.
     """
-    columns, rows, comma = cells(path, text)
+    columns, rows, comma = split_cells(path, text)
     columns = [name.lower() for name in columns]
     metres = [(place, _METRES[match[1]]) for place, name in enumerate(columns) if (match := _DISTANCE.fullmatch(name))]
     time = _time_column(columns)
@@ -275,18 +275,18 @@ def _parse_seconds(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarra
 def _project_to_plane(degrees: np.ndarray) -> np.ndarray:
     """Project latitudes and longitudes [N, 2], degrees, to positions [N, 2] in m relative to the first one."""
     turned = np.radians(degrees - degrees[:1])
-    return _EARTH * np.stack([turned[:, 0], turned[:, 1] * np.cos(np.radians(degrees[:1, 0]))], axis=1)
+    return _EARTH_RADIUS * np.stack([turned[:, 0], turned[:, 1] * np.cos(np.radians(degrees[:1, 0]))], axis=1)
 
 
-def _project_on_path(places: np.ndarray) -> np.ndarray:
+def _project_on_path(positions: np.ndarray) -> np.ndarray:
     """Return distances [N] along the straight line fitted to positions [N, 2 or 3], from the first one; NaN if any is invalid.
 
     Lateral deviations from the line do not count. The direction of travel is positive.
     """
-    if not np.isfinite(places).all() or np.abs(places).max(initial=0.0) > 1e9:
-        return np.full(len(places), np.nan)
-    centred = places - places.mean(axis=0)
-    direction = np.linalg.svd(centred, full_matrices=False)[2][0] if len(places) > 1 else np.eye(places.shape[1])[0]
+    if not np.isfinite(positions).all() or np.abs(positions).max(initial=0.0) > 1e9:
+        return np.full(len(positions), np.nan)
+    centred = positions - positions.mean(axis=0)
+    direction = np.linalg.svd(centred, full_matrices=False)[2][0] if len(positions) > 1 else np.eye(positions.shape[1])[0]
     along = centred @ direction
     along = along if along[-1] >= along[0] else -along
     return along - along[0]
