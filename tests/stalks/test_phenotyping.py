@@ -32,7 +32,7 @@ CAMERAS = Calibration(640, 480, 500.0, (319.5, 239.5), 0.1)
 def test_strips_are_as_wide_as_they_are(lean, ratio, bound, soft):
     # Of an upright strip, the pixels whose middle it covers say its width to a pixel only: the mean over places is right.
     widths, places = ((39.0,), 4) if lean or soft else ((39.0,), 1)
-    errors = STRIPS["mean_errors"](STRIPS["strip"], ratio, lean, soft, places, widths)
+    errors = STRIPS["mean_errors"](STRIPS["width_by_strip"], ratio, lean, soft, places, widths)
     assert np.abs(errors).max() < bound
 
 
