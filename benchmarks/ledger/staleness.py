@@ -69,7 +69,7 @@ _SHOWN = 4  # number of changed files in a message
 
 @dataclasses.dataclass(frozen=True)
 class Stale:
-    """Stale records of one file, name and revision.
+    """Stale records of one file, name, revision and reason.
 
     Attributes:
         file: File of records.
@@ -91,11 +91,17 @@ class Stale:
 
 
 def stale_records(folder: Path, checkout: Path = CHECKOUT) -> list[Stale]:
-    """Find the stale records in ``folder``, grouped by file, name and revision.
+    """Find the stale records in ``folder``, grouped by file, name, revision and reason, and sorted in this order.
+
+    Records of one file, name and revision can have several reasons, as these depend on the environment and the kind of device.
 
     Args:
         folder: Folder of records, see `records.read_all`.
         checkout: Git checkout of the records' revisions. Its working tree is compared.
+
+    Raises:
+        RequestError: The folder does not exist, or a file in it cannot be read.
+        FileNotFoundError: A file listed in `MEASURED` does not exist.
     """
     groups: dict[tuple[str, str, str, str], int] = {}
     reason_once = functools.cache(functools.partial(staleness_reason, checkout=checkout))

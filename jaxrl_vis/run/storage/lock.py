@@ -131,11 +131,15 @@ def run_lock(folder: Path, echo: Callable[[str], None] = print) -> Iterator[Held
 
 
 def _lock_by_system(path: Path, stack: contextlib.ExitStack) -> bool:
-    """Lock the file until the end of ``stack``; return False if the file system has no locks, or its holder found none.
+    """Lock the file through the operating system until the end of ``stack``, and write this host and process into it.
+
+    Returns:
+        True if this process holds the lock. False if the file must itself serve as the lock (`_lock_by_marker`): the file system
+        does not support locks, or another process has concluded so and already uses the file in this way.
 
     Raises:
-        RequestError: Another process holds it.
-        OSError: It cannot be opened.
+        RequestError: Another process holds the lock.
+        OSError: The file cannot be opened.
     """
     if _read(path).startswith(_MARKER) or not _has_locks(path.parent):
         return False

@@ -96,15 +96,20 @@ def _csv_rows(named: LabelledLine, base: Line | None, levels: Sequence[float], c
 def weights_table(
     weighted: Mapping[str, Line], alone: Mapping[tuple[str, str], Line], bases: Mapping[str, Line], names: Mapping[str, str]
 ) -> tuple[list[str], list[dict[str, Any]]]:
-    """Tabulate mean weights of auxiliary losses with the gain of each one alone, and their rank correlation (Spearman's).
+    """Tabulate the mean weight of each auxiliary loss and its gain alone, with Spearman's rank correlation between the two.
 
-    The gain is the difference of mean success to the run without auxiliary losses, up to the shorter run's end.
+    The gain is the mean success of the run with this loss alone minus that of the run without auxiliary losses, both up to the
+    end of the shorter run.
 
     Args:
         weighted: Runs with all losses, by task.
-        alone: Runs with a single auxiliary loss, by (task, auxiliary loss), as far as they exist.
-        bases: Runs without auxiliary losses, by task, as far as they exist.
+        alone: Runs with a single auxiliary loss, by (task, auxiliary loss); those that do not exist yet are left out.
+        bases: Runs without auxiliary losses, by task; those that do not exist yet are left out.
         names: Labels of the auxiliary losses, by name.
+
+    Returns:
+        Lines of Markdown, a table for each task followed by the correlation once all gains are known; and rows for
+        `spreadsheets.to_csv`, whose ``gain_alone`` is None where a run is missing.
     """
     text: list[str] = []
     rows: list[dict[str, Any]] = []

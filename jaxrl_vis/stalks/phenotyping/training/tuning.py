@@ -169,7 +169,23 @@ def tune(
 
 
 class _EarlyStopping:
-    """Early stopping: evaluate parameters on held-out images and keep the best ones, which may be the initial ones."""
+    """Early stopping on held-out images, which keeps the parameters with the best soft F1 (`Score.soft`).
+
+    Without held-out images nothing is evaluated, and ``params`` remain the initial ones: do not use them.
+
+    Args:
+        examples: Held-out images; may be empty.
+        shape: Height and width to which images are padded.
+        settings: Settings of the networks.
+        dtype: Compute dtype of the convolutions.
+        params: Initial parameters, evaluated at once.
+        patience: Number of evaluations without improvement after which training should stop.
+
+    Attributes:
+        params: Copy of the best parameters so far, which may be the initial ones.
+        step: Update after which they were reached; 0 for the initial ones.
+        best: Their soft F1; 0 without held-out images.
+    """
 
     def __init__(
         self, examples: list[Example], shape: tuple[int, int], settings: Settings, dtype: Any, params: Any, patience: int

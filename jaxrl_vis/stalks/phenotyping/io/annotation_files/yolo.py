@@ -40,7 +40,10 @@ def read_names(path: Path) -> list[str]:
 
 
 def is_yolo(text: str) -> bool:
-    """Return True if a text is in YOLO format: lines of at least five words, the first of which is a class number, or none."""
+    """Return True if every non-blank line has at least five words and begins with a class number of at most four digits.
+
+    A text without such lines, which annotates nothing, is in YOLO format, too.
+    """
     lines = [line.split() for line in text.splitlines() if line.strip()]
     return all(len(words) >= 5 and re.fullmatch(r"\d{1,4}", words[0]) is not None for words in lines)
 
