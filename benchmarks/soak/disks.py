@@ -15,7 +15,7 @@ def _run(*command: str) -> bool:
 
 
 @contextlib.contextmanager
-def _move_to(folder: Path, disk: Path, mounted: bool) -> Iterator[Path]:
+def _run_folder_on_disk(folder: Path, disk: Path, mounted: bool) -> Iterator[Path]:
     """Copy the run folder to another disk, then back, and unmount; yield ``folder`` itself if nothing is mounted."""
     there = disk / "run"
     try:
@@ -57,7 +57,7 @@ def small_disk(folder: Path) -> Iterator[tuple[Path, Callable[[], bool]]]:
                         pass
         return True
 
-    with _move_to(folder, disk, mounted) as there:
+    with _run_folder_on_disk(folder, disk, mounted) as there:
         yield there, fill
 
 
@@ -82,7 +82,7 @@ def freezing_disk(folder: Path) -> Iterator[tuple[Path, Callable[[bool], bool]]]
         is_frozen = still
         return True
 
-    with _move_to(folder, disk, mounted) as there:
+    with _run_folder_on_disk(folder, disk, mounted) as there:
         try:
             yield there, freeze
         finally:

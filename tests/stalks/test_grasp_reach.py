@@ -241,7 +241,7 @@ def test_a_stalk_that_stands_alone_is_held_alone():
     for index, stalk in zip(ALONE, (0, 1, 2, 7)):
         assert stalks_held(found, index) == {stalk}
     assert (found.error[ALONE] < 0.002).all()
-    assert not found.touched[ALONE].any() and not found.brushed[ALONE].any()
+    assert not found.arm_contact[ALONE].any() and not found.gripper_contact[ALONE].any()
 
 
 def test_a_grasp_holds_none_or_several_where_none_or_several_are():
@@ -382,7 +382,7 @@ def test_a_policy_drives_the_arm_and_its_goals_are_of_what_was_found():
     jax.effects_barrier()
     assert {int(each) for each in truth.stalk[0][result.held[0]]} == {0}
     assert result.taken.shape == (1, 60, 3) and result.error[0] < 0.005
-    assert not result.touched[0, truth.stalk[0] == 1].any()
+    assert not result.arm_contact[0, truth.stalk[0] == 1].any()
     observation, goal = (np.asarray(each) for each in seen[-1])
     assert observation.shape == goal.shape == (4, 16, 16)
     # The second stalk was not found: it is in what the policy sees, and not in its goal.

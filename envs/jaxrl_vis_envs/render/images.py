@@ -230,7 +230,7 @@ def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: bl
         normal = tuple(jnp.where(hit_mask, component, 0.0) for component in hit.normal)
         sheets = transparent.intersect_sheets(scene, view.unit, view.table, rays, far)
         if outputs.rgb:
-            blocked = _blocked_where(scene, view, hit_mask) if nearest.triangle is not None else None
+            blocked = _make_occlusion_test(scene, view, hit_mask) if nearest.triangle is not None else None
             front = shade.shade(scene, view.unit, lights.unpack(scene, view.lights), row, hit, rays, blocked)
             background = shade.sky(scene, view.rotation, rays)
             colour = tuple(jnp.where(hit_mask, one, other) for one, other in zip(front, background, strict=True))
@@ -246,7 +246,7 @@ def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: bl
     return Planes(colour, far if outputs.depth else None, labels, normal if outputs.normals else None, length)
 
 
-def _blocked_where(scene: Scene, view: _View, shown: jax.Array) -> Callable[[triangles.Segments], jax.Array]:
+def _make_occlusion_test(scene: Scene, view: _View, shown: jax.Array) -> Callable[[triangles.Segments], jax.Array]:
     """Return the test for triangles on segments from pixels [P], False unless ``shown``."""
 
     def blocked(segments: triangles.Segments) -> jax.Array:

@@ -134,8 +134,8 @@ def _lock_by_system(path: Path, stack: contextlib.ExitStack) -> bool:
     """Lock the file through the operating system until the end of ``stack``, and write this host and process into it.
 
     Returns:
-        True if this process holds the lock. False if the file must itself serve as the lock (`_lock_by_marker`): the file system
-        does not support locks, or another process has concluded so and already uses the file in this way.
+        True if this process holds the lock. False if the file must itself serve as the lock (`_lock_by_marker`): the file
+        system does not support locks, or another process has concluded so and already uses the file in this way.
 
     Raises:
         RequestError: Another process holds the lock.

@@ -86,8 +86,8 @@ def reach_by_policy(
         held=result["held"] & mine,
         path=result["path"] + stands.origin[:, None],
         taken=result["taken"] + stands.origin[:, None],
-        touched=result["touched"] & mine,
-        brushed=result["brushed"] & mine,
+        arm_contact=result["arm_contact"] & mine,
+        gripper_contact=result["gripper_contact"] & mine,
         reachable=can,
         error=np.where(can, error, np.nan).astype(np.float32),
         poses=result["poses"],
@@ -137,6 +137,11 @@ def _compile_programs(policy: Policy) -> tuple[Any, Any]:
             start = _LoopState(begin(arms, scene, HOME), jnp.asarray(HOME, jnp.float32))
             steps = round((timing.reach + timing.close) / env.control_period)
             (reaching, _), history = jax.lax.scan(step, start, length=steps)
-        return {**history, "held": held_stalks(arms, reaching.data), "touched": reaching.touched, "brushed": reaching.brushed}
+        return {
+            **history,
+            "held": held_stalks(arms, reaching.data),
+            "arm_contact": reaching.arm_contact,
+            "gripper_contact": reaching.gripper_contact,
+        }
 
     return jaxrl_vis_envs.jit(jax.vmap(draw)), jaxrl_vis_envs.jit(jax.vmap(episode))

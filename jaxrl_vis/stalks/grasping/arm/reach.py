@@ -47,8 +47,8 @@ class ReachResult:
         held: [B, N] bool, stalks between the closed jaws.
         path: [B, T, 3] float32, planned positions of the grip, m in the plot's frame.
         taken: [B, T, 3] float32, actual positions of the grip, m in the plot's frame.
-        touched: [B, N] bool, stalks that upper arm or forearm touched at any time.
-        brushed: [B, N] bool, stalks that the open jaws or the palm touched before the jaws began to close.
+        arm_contact: [B, N] bool, stalks that upper arm or forearm touched at any time.
+        gripper_contact: [B, N] bool, stalks that the open jaws or the palm touched before the jaws began to close.
         reachable: [B] bool, whether the target is within the arm's reach.
         error: [B] float32, distance of the grip from the target when the jaws began to close, m; NaN if out of reach.
         poses: [B, T, J] float32, positions of all joints of the model, for rendering (`video`).
@@ -58,8 +58,8 @@ class ReachResult:
     held: np.ndarray
     path: np.ndarray
     taken: np.ndarray
-    touched: np.ndarray
-    brushed: np.ndarray
+    arm_contact: np.ndarray
+    gripper_contact: np.ndarray
     reachable: np.ndarray
     error: np.ndarray
     poses: np.ndarray
@@ -88,14 +88,14 @@ class Reaching(NamedTuple):
         data: State of the physics, an `mjx.Data`.
         controllers: State of the controllers.
         start: [3] float32, position of the grip at time 0, m in the frame of the stand.
-        touched, brushed: [N] bool, stalks touched so far; see `ReachResult`.
+        arm_contact, gripper_contact: [N] bool, stalks touched so far; see `ReachResult`.
     """
 
     data: Any
     controllers: ControllerState
     start: jax.Array
-    touched: jax.Array
-    brushed: jax.Array
+    arm_contact: jax.Array
+    gripper_contact: jax.Array
 
 
 class Scene(NamedTuple):
@@ -211,8 +211,8 @@ def reach(
         held=parts[-1]["held"] & mine,
         path=paths["path"] + stands.origin[:, None],
         taken=paths["taken"] + stands.origin[:, None],
-        touched=parts[-1]["touched"] & mine,
-        brushed=parts[-1]["brushed"] & mine,
+        arm_contact=parts[-1]["arm_contact"] & mine,
+        gripper_contact=parts[-1]["gripper_contact"] & mine,
         reachable=can,
         error=np.where(can, error, np.nan).astype(np.float32),
         poses=paths["poses"],
@@ -314,8 +314,8 @@ def _advance(
     data = mjx_model.kinematics(model, reaching.data)
     report |= {
         "held": held_stalks(arms, data),
-        "touched": reaching.touched,
-        "brushed": reaching.brushed,
+        "arm_contact": reaching.arm_contact,
+        "gripper_contact": reaching.gripper_contact,
         "stalks": bending.at_height(data, arms.layout, target[2]),
     }
     return reaching._replace(data=data), report
@@ -347,9 +347,9 @@ def step_control(
     none = jnp.zeros(model.nv - stalk_arm.JOINTS, jnp.float32)
     data = mjx_model.step(model, data.replace(qfrc_applied=wind + jnp.concatenate([forces, jaws, none])), False)
     touches = {name: data._impl.contact.dist[places] < 0 for name, places in arms.contacts.items()}
-    touched = reaching.touched | touches["forearm"] | touches["upper_arm"]
+    arm_contact = reaching.arm_contact | touches["forearm"] | touches["upper_arm"]
     by_gripper = touches["left_jaw"] | touches["right_jaw"] | touches["palm"]
-    return Reaching(data, memory, reaching.start, touched, reaching.brushed | (by_gripper & ~is_closing))
+    return Reaching(data, memory, reaching.start, arm_contact, reaching.gripper_contact | (by_gripper & ~is_closing))
 
 
 def held_stalks(arms: ArmModel, data: Any) -> jax.Array:

@@ -285,8 +285,8 @@ def to_attempts(
                 held=frozenset(stands.stalk[index][result.held[index] & sent].tolist()),
                 reachable=bool(result.reachable[index]),
                 refused=bool(refused[index]),
-                collided=bool((result.touched[index] & others).any()),
-                brushed=bool((result.brushed[index] & others).any()),
+                collided=bool((result.arm_contact[index] & others).any()),
+                brushed=bool((result.gripper_contact[index] & others).any()),
                 aim_error=float(errors[index]),
             )
         )
