@@ -49,7 +49,7 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/index.md": {"comparison": comparison.comparison_table},
     "docs/lab/results.md": {"results table": lab_results.results_table, "speed table": lab_results.speed_table},
     "docs/scaling.md": {"devices": scaling.devices_table, "processes": scaling.processes_table},
-    "docs/lab/meshes.md": {"meshes": render.mesh_table},
+    "docs/lab/meshes.md": {"meshes": render.gpu_mesh_table, "meshes on a CPU": render.cpu_mesh_table},
     "docs/lab/renderer_speed.md": {"warp": render.warp_table, "mujoco": render.mujoco_table},
     "docs/reliability.md": {"soak": soak},
     "docs/lab/renderer_parity.md": {"table": renderer_parity},

@@ -8,7 +8,7 @@ from jaxrl_vis.bench.record import load
 
 _WARP_RECORDS, _MUJOCO_RECORDS = "render-nvidia-h200-x1.json", "render-amd-epyc-2-cores.json"
 _MESH_RECORDS = "render-nvidia-h100-80gb-hbm3-x1.json"
-_OURS, _WARP = "render/scene", "render/peer_warp"
+_OURS, _WARP, _MUJOCO = "render/scene", "render/peer_warp", "render/peer_mujoco"
 _ORDER = ("finger", "fetch_reach", "primitives")
 _TEXTURED = ("finger", "primitives")  # fetch_reach has no textures to omit
 _OUTPUTS = {"rgbd": "RGB-D", "depth": "depth"}
@@ -57,16 +57,25 @@ def warp_table(results: Path) -> str:
 
 def mujoco_table(results: Path) -> str:
     """Return a table that compares MuJoCo's own renderer with ours, in images per second, as Markdown."""
-    return _table(results / _MUJOCO_RECORDS, "render/peer_mujoco", "`mujoco.Renderer`", with_depth=True)
+    return _table(results / _MUJOCO_RECORDS, _MUJOCO, "`mujoco.Renderer`", with_depth=True)
 
 
-def mesh_table(results: Path) -> str:
+def gpu_mesh_table(results: Path) -> str:
     """Return a table that compares MuJoCo Warp's renderer with ours on scenes of meshes, in images per second, as Markdown."""
-    records = [record for record in load(results / _MESH_RECORDS) if record["config"]["pixels"] == "rgbds"]
+    return _mesh_table(results / _MESH_RECORDS, _WARP, "MuJoCo Warp 4.0.0")
+
+
+def cpu_mesh_table(results: Path) -> str:
+    """Return a table that compares MuJoCo's own renderer with ours on scenes of meshes, in images per second, as Markdown."""
+    return _mesh_table(results / _MUJOCO_RECORDS, _MUJOCO, "`mujoco.Renderer`")
+
+
+def _mesh_table(file: Path, peer: str, title: str) -> str:
+    records = [record for record in load(file) if record["config"]["pixels"] == "rgbds"]
     ours = {str(record["config"]): record for record in records if record["name"] == _OURS}
-    lines = ["| scene | images | ours | MuJoCo Warp 4.0.0 | ratio |", "|---|---|---|---|---|"]
+    lines = [f"| scene | images | ours | {title} | ratio |", "|---|---|---|---|---|"]
     for record in records:
-        if record["name"] != _WARP:
+        if record["name"] != peer:
             continue
         config, size = record["config"], record["config"]["image_size"]
         names = [name for name in ("textures", "shadows") if config.get(name)]
