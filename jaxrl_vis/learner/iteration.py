@@ -135,7 +135,9 @@ def make_learn(
         means = {f"train/{name}": jnp.mean(values) for name, values in outcome.items()}
         means |= algorithm.diagnose(train.agent, train.statistics, episodes.observations[:, -1])
         metrics |= shards.mean(means)
-        metrics["guard/nonfinite"] = shards.total(_count_nonfinite((metrics, episodes.states, episodes.actions)))
+        metrics["guard/nonfinite"] = shards.total(
+            _count_nonfinite((metrics, episodes.states, episodes.full_states, episodes.actions))
+        )
         replay_state = layout.fold_replay(replay_state, num_envs)
         return Learned(LoopState(train=train, replay=replay_state, key=loop.key, iteration=loop.iteration + 1), metrics)
 

@@ -60,6 +60,7 @@ class TrainStep:
     Attributes:
         env, config, resolved, acting, auxiliary: Components from which the programs were built.
         replay: Sizes of one device's part of a learner's replay.
+        replay_spec: Shapes and dtypes of this part; nothing is allocated.
         layout: Placement of seeds and shards; all programs take and return arrays with this placement.
         exploration: Exploration noise of training; evaluations have none.
         plays_parts: True if ``play`` can start at any environment, and thus also evaluate; otherwise it runs a whole rollout.
@@ -78,6 +79,7 @@ class TrainStep:
     acting: Acting
     auxiliary: Auxiliary
     replay: Replay
+    replay_spec: ReplayState
     layout: Layout
     exploration: Exploration
     plays_parts: bool
@@ -116,14 +118,6 @@ class TrainStep:
         return math.ceil(self.config.run.env_steps / self.steps_per_iteration)
 
     @property
-    def replay_spec(self) -> ReplayState:
-        """Shapes and dtypes of one seed's replay, or of one device's part of it; nothing is allocated."""
-        observation = self.env.observation_spec
-        stored = self.auxiliary.stored_spec(observation, self.env.horizon)
-        full_state_size = _full_state_size(self.env, self.config)
-        return self.replay.spec(observation, self.env.goal_state_size, self.env.action_size, stored, full_state_size)
-
-    @property
     def replay_bytes(self) -> int:
         """Size of one seed's replay in bytes."""
         return num_bytes(self.replay_spec) * self.layout.shards.count
@@ -131,7 +125,9 @@ class TrainStep:
     @property
     def parts_spec(self) -> list[PartResult]:
         """Shapes, dtypes and placement of the parts of a rollout, as `learn` takes them."""
-        spec = part_result_spec(self.env, self.part_size, self.config.run.seeds, _full_state_size(self.env, self.config))
+        full_states = self.replay_spec.episodes.full_states
+        full_state_size = 0 if full_states is None else full_states.shape[-1]
+        spec = part_result_spec(self.env, self.part_size, self.config.run.seeds, full_state_size)
         spec = self.layout.with_shardings(spec, self.layout.by_environment)
         return [spec] * math.ceil(self.config.run.num_envs / self.part_size)
 
@@ -295,6 +291,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         acting=acting,
         auxiliary=auxiliary,
         replay=replay,
+        replay_spec=replay_spec,
         layout=layout,
         exploration=Exploration(config.ddpg.random_action_probability, config.ddpg.action_noise),
         plays_parts=plays_parts,

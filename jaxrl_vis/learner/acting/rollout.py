@@ -160,18 +160,16 @@ def play(
         noisy = jax.vmap(lambda key, part: add_noise(key, part, deviation, draws))(noise_keys, by_seed(observations))
         return noisy.reshape(observations.shape)
 
-    def full_state(state: State) -> jax.Array | None:
-        return None if observe_state is None else stored(jax.vmap(observe_state)(state.data))
-
-    def recorded(state: State) -> Any:
-        return None if record is None else jax.tree.map(stored, jax.vmap(record)(state))
+    def recorded(state: State) -> tuple[jax.Array | None, Any]:
+        full_state = None if observe_state is None else jax.vmap(observe_state)(state.data)
+        return jax.tree.map(stored, (full_state, None if record is None else jax.vmap(record)(state)))
 
     reset_keys, policy_keys = split_keys(keys, num_envs, draws)
     state = jax.vmap(env.reset)(reset_keys)
     assert state.obs is not None
     first_observation = perturb(state.obs["observation"], policy_keys, _FIRST_NOISE)
     goal = perturb(state.obs["desired_goal"], policy_keys, _GOAL_NOISE)
-    first_state, first_full_state, first_record = state.achieved_state, full_state(state), recorded(state)
+    first_state, first_records = state.achieved_state, recorded(state)
     policies = jax.vmap(algorithm.policy_params)(train.agent, train.statistics)
     aims = jax.vmap(algorithm.aim)(policies, by_seed(goal))
 
@@ -184,15 +182,13 @@ def play(
         state = jax.vmap(env.advance)(state, action)
         observation = perturb(jax.vmap(env.observe)(state), step_keys, _STEP_NOISE)
         step_results = tuple(stored(leaf) for leaf in (observation, state.achieved_state, action))
-        return (state, observation), (step_results, full_state(state), recorded(state))
+        return (state, observation), (step_results, recorded(state))
 
     carry = (state.replace(obs=None), first_observation)
     step_keys = jax.vmap(lambda key: jax.random.split(key, env.horizon), out_axes=1)(policy_keys)
-    (state, _), ((observations, states, actions), full_states, records) = jax.lax.scan(step, carry, step_keys)
+    (state, _), ((observations, states, actions), records) = jax.lax.scan(step, carry, step_keys)
     outcome = {name: by_seed(state.metrics[name]) for name in env.metric_names}
-    first, rest = (first_full_state, first_record), (full_states, records)
-    full_states, record_of_all = jax.tree.map(lambda first, rest: _episode_major(first[None], rest), first, rest)
-
+    full_states, record_of_all = jax.tree.map(lambda first, rest: _episode_major(first[None], rest), first_records, records)
     episodes = Episodes(
         observations=_episode_major(stored(first_observation)[None], observations, stored(goal)[None]),
         states=_episode_major(stored(first_state)[None], states, stored(state.goal_state)[None]),
