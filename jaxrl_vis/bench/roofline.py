@@ -63,6 +63,7 @@ def minimum_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
     minus the gradient with respect to the image), and every target encoder runs forward on two; without target encoders, every
     online encoder also encodes the next image. The actor's head runs forward once as the target and once in both directions;
     the critic's once as the target, once in both directions, and once more in the actor's loss, forward and back to the action.
+    A critic that observes true states has no encoder.
 
     Bytes: three images per transition are read once from the replay; online parameters and two Adam moments are read and
     written once, target parameters are read and written once. Activations are assumed to stay on the chip.
@@ -77,13 +78,13 @@ def minimum_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
     spec, hidden, actions = networks.observation_spec, config.network.hidden_sizes, networks.action_size
     latent = config.network.latent_size if networks.sees_images else math.prod(spec.shape)
     actor_head = head_products((2 * latent, *hidden, actions))
-    critic_head = head_products((2 * latent + actions, *hidden, 1))
-    separate, actor_share = config.network.encoders == "separate", 1.0 / config.ddpg.actor_interval
+    critic_head = head_products((actions + (networks.critic_state_size or 2 * latent), *hidden, 1))
+    actor_share = 1.0 / config.ddpg.actor_interval
     learned = 2 * (3 * encoder - first_layer)
     followed = (2 if config.network.target_encoder else 1) * encoder
-    critic_products = learned + followed + (1 + 3) * critic_head
-    actor_products = (followed if separate else 0) + actor_head
-    actor_step_products = (learned if separate else 0) + 3 * actor_head + 2 * critic_head
+    critic_products = (0 if networks.critic_state_size else learned + followed) + (1 + 3) * critic_head
+    actor_products = (0 if networks.shares_encoder else followed) + actor_head
+    actor_step_products = (0 if networks.shares_encoder else learned) + 3 * actor_head + 2 * critic_head
     products = critic_products + actor_products + actor_share * actor_step_products
 
     images = 3 * batch_size * math.prod(spec.shape) * spec.dtype.itemsize

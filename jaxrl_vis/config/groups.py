@@ -178,10 +178,11 @@ class DDPGOptions:
     actor_log: Annotated[Literal["value", "loss"], OfWeighting()] = "value"
     """Quantity whose logarithm the actor minimises, with log weightings. value: log(Q_max - Q) plus the action penalty, as in
     the authors' release, so the penalty's relative weight grows with Q_max - Q. loss: log(Q_max - Q + penalty), which keeps
-    their ratio."""
+    their ratio. With critic_states always loss."""
     critic_states: Annotated[bool, OfAlgorithm(("ddpg", "td3"))] = False
-    """The critic observes the true state and goal state in addition to the images, which makes it easier to train; the policy
-    still sees images only (asymmetric actor-critic, Pinto et al., 2018)."""
+    """The critic observes the true state and goal state instead of the images, which makes it easier and faster to train; the
+    policy sees images only. Its own encoder is then that of the auxiliary losses (asymmetric actor-critic, Pinto et al.,
+    2018)."""
     clip_targets_above: bool = True
     """Clip critic targets at R+/(1-gamma) too (they are always clipped at R-/(1-gamma) below)."""
     random_action_probability: Fraction = 0.3
@@ -228,7 +229,8 @@ class NetworkOptions:
     hidden_sizes: tuple[Count, ...] = (256, 256, 256)
     """Hidden layers of the actor's and the critic's heads."""
     encoders: Literal["separate", "shared"] = "separate"
-    """Encoder of the actor: its own (separate), or the critic's, which the actor's loss does not update (shared)."""
+    """Encoder of the actor: its own (separate; always with critic_states), or the critic's, which the actor's loss does not
+    update (shared)."""
     target_encoder: bool = True
     """Use slowly updated target encoders; if false, the target heads read the latents of the online encoders."""
     random_shift: Annotated[int, Bounds(0, MAX_COUNT)] = 0

@@ -38,7 +38,7 @@ class Setup:
         action_size: A; actions lie in [-1, 1].
         auxiliary: Auxiliary tasks of the run and their weighting; an algorithm may ignore them.
         shards: Shards of the learner: batches are those of one shard, gradients and metrics must be those of the whole.
-        critic_state_size: P, size of the true states that the critic also observes; 0 if it observes none.
+        critic_state_size: P, size of the true states that the critic observes instead of images; 0 for what the actor observes.
     """
 
     config: Config

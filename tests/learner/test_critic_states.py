@@ -1,4 +1,4 @@
-"""Critic that observes true states in addition to images."""
+"""Critic that observes true states instead of images."""
 
 import jax
 import jax.numpy as jnp
@@ -63,17 +63,27 @@ def test_values_of_states_and_goals_that_no_image_shows():
     states = jnp.array([[x, 1.0, goal] for goal in (0.0, 5.0) for x in (-3.0, -2.0, -1.0)])
     scaling = networks.scaling(train.state_normalizer)
     states = (states - scaling.mean) * scaling.scale
-    latents = networks.encode(train.agent.critic, networks.prepare(networks.scaling(train.normalizer), jnp.zeros((6, 1, 8, 8))))
-    values = networks.value(train.agent.critic, jnp.stack([latents, latents]), jnp.zeros((6, 1)), states)
+    values = networks.value(train.agent.critic, states, jnp.zeros((6, 1)))
     expected = [-1.0 - DISCOUNT, -1.0, 0.0, *[-1.0 / (1.0 - DISCOUNT)] * 3]
     np.testing.assert_allclose(values, expected, atol=0.3)
 
 
 def test_policy_follows_goals_that_it_sees():
-    program, train, metrics = trained(Lit(), 25, relabel_probability=0.9, encoders="separate", normalizer_floor=1.0)
+    program, train, metrics = trained(Lit(), 25, relabel_probability=0.9, normalizer_floor=1.0)
     outcome, _ = program.evaluate(train, jax.random.key(11))
     assert outcome["eval/success"][0] >= 0.95
     assert "train/value_at_goals" not in metrics  # it has no true state
+
+
+def test_auxiliary_losses_train_the_policy_s_encoder():
+    program, train, metrics = trained(
+        Lit(), 25, relabel_probability=0.9, normalizer_floor=1.0, aux_tasks=("inverse_dynamics",), weighting="ol_aux"
+    )
+    outcome, _ = program.evaluate(train, jax.random.key(11))
+    assert outcome["eval/success"][0] >= 0.95
+    assert set(train.agent.critic) == {"head"} and set(train.agent.actor) == {"encoder", "head", "heads"}
+    assert metrics["train/weight/inverse_dynamics"][0] != 1.0  # learned from dots with the gradient of the policy's loss
+    assert metrics["train/loss/inverse_dynamics"][0] < 0.1
 
 
 def test_batches_hold_the_states_before_and_after_each_transition():

@@ -58,26 +58,26 @@ class Auxiliary:
         """Initialise the parameters of all heads, by task, from a typed key []."""
         return {name: task.init(task.fold(key)) for name, task in self.tasks.items()}
 
-    def init_state(self, critic: Params, key: jax.Array) -> WeightingState | None:
+    def init_state(self, params: Params, key: jax.Array) -> WeightingState | None:
         """Initialise the weighting's state; None without a weighting.
 
         Args:
-            critic: All parameters of the critic, in whose encoder gradients are compared.
+            params: All parameters of the network in whose encoder gradients are compared.
             key: [] typed key of the learner.
         """
         if self.weighting.name == "none":
             return None
-        state = self.start(critic)
+        state = self.start(params)
         return state if state.key is None else state.replace(key=jax.random.fold_in(key, _DRAWS))
 
-    def start(self, critic: Params) -> WeightingState:
+    def start(self, params: Params) -> WeightingState:
         """Return the weighting's own initial state, with the same key for every learner, if it has one.
 
         Args:
-            critic: All parameters of the critic.
+            params: All parameters of the network in whose encoder gradients are compared.
         """
-        params = (critic,) if self.weighting.hold is not None else ()
-        return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *params)
+        held = (params,) if self.weighting.hold is not None else ()
+        return self.weighting.init((MAIN, *self.tasks), params.get("encoder"), *held)
 
     def with_stored(self, episodes: Episodes) -> Episodes:
         """Return the E episodes of a rollout with the arrays that tasks compute once per episode (`AuxTask.episode`)."""

@@ -5,7 +5,7 @@
     apply        optimisers, then target networks
     update       all of them, in a scan over the batches of an iteration
 
-The losses are in `objectives`.
+The losses are in `objectives`, their gradients in `network_gradients`.
 
 Encoding images dominates the cost, and options of `Config` reduce it: with ``encoders="shared"`` the actor uses the critic's
 latents, with ``target_encoder=False`` targets use the online encoders, and ``actor_interval`` makes actor steps less frequent.
@@ -23,15 +23,16 @@ import optax
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner.algorithm import Algorithm, Batches, Setup
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary, make_auxiliary
-from jaxrl_vis.learner.ddpg import adam, diagnostics
+from jaxrl_vis.learner.ddpg import adam, diagnostics, network_gradients
 from jaxrl_vis.learner.ddpg.learned_reward import LearnedReward, make_learned_reward
+from jaxrl_vis.learner.ddpg.network_gradients import PreparedBatch
 from jaxrl_vis.learner.ddpg.objectives import ComputeCopies, Objectives
-from jaxrl_vis.learner.networks.networks import BatchScaling, Inputs, Networks
+from jaxrl_vis.learner.networks.networks import BatchScaling, Networks
 from jaxrl_vis.learner.networks.policy import PolicyParams, make_policy
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
 from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, Metrics, Params, Replaceable, Statistics
-from jaxrl_vis.weighting import MAIN, Weighted, WeightingState
+from jaxrl_vis.weighting import WeightingState
 
 # Folded into the networks' keys for the heads of auxiliary tasks, so that these change no other random numbers.
 _HEADS = 0x686473
@@ -78,22 +79,6 @@ class WorkingState(NamedTuple):
     copies: ComputeCopies
     scaling: BatchScaling
     counts: jax.Array
-
-
-class PreparedBatch(NamedTuple):
-    """Batch in the form that `GradientSteps.gradients` takes.
-
-    Attributes:
-        batch: Batch of transitions, with rewards unless a learned model computes them.
-        inputs: Its observations in the form that encoders read.
-        image: [B, C, H, W] its observations before the action, normalised, if an auxiliary task needs them; else None.
-        noise: [B, A] float32, added to the next actions in the critic's targets; None for no noise.
-    """
-
-    batch: Batch
-    inputs: Inputs
-    image: jax.Array | None = None
-    noise: jax.Array | None = None
 
 
 class Gradients(NamedTuple):
@@ -143,7 +128,8 @@ def _start(networks: Networks, auxiliary: Auxiliary, learned_reward: LearnedRewa
     target_actor, target_critic = networks.init_target(actor), networks.init_target(critic)
     if auxiliary.tasks:
         actor_key, critic_key = (jax.random.fold_in(network_key, _HEADS) for network_key in (actor_key, critic_key))
-        critic["heads"] = auxiliary.init_heads(critic_key)
+        if not networks.critic_state_size:
+            critic["heads"] = auxiliary.init_heads(critic_key)
         if "encoder" in actor:
             actor["heads"] = auxiliary.init_heads(actor_key)
     return Agent(
@@ -154,7 +140,7 @@ def _start(networks: Networks, auxiliary: Auxiliary, learned_reward: LearnedRewa
         actor_optimizer=adam.init(actor),
         critic_optimizer=adam.init(critic),
         updates=jnp.zeros((), jnp.int32),
-        weighting=auxiliary.init_state(critic, key),
+        weighting=auxiliary.init_state(actor if networks.critic_state_size else critic, key),
         reward_model=None if learned_reward is None else learned_reward.init(jax.random.fold_in(key, _REWARD_MODEL)),
     )
 
@@ -224,16 +210,6 @@ def _value_at_goals(networks: Networks, agent: Agent, statistics: Statistics, go
     return {"train/value_at_goals": jnp.mean(networks.value(agent.critic, latents(agent.critic), action))}
 
 
-def _loss_metrics(weighted: Weighted, value: jax.Array) -> Metrics:
-    """Return the metrics of the critic: its losses, their weighting, and the mean of its values [B]."""
-    return {
-        "train/critic_loss": weighted.losses[MAIN],
-        "train/value": jnp.mean(value),
-        **{f"train/{name}": number for name, number in weighted.metrics.items()},
-        **{f"train/loss/{name}": loss for name, loss in weighted.losses.items() if name != MAIN},
-    }
-
-
 def make_ddpg(
     networks: Networks, config: Config, resolved: Resolved, auxiliary: Auxiliary | None = None, shards: Shards = ONE
 ) -> GradientSteps:
@@ -250,7 +226,7 @@ def make_ddpg(
         auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)
     learned_reward = make_learned_reward(networks, config, resolved)
     learning = Objectives(networks, config, resolved, auxiliary, shards)
-    keeps_state = auxiliary.weighting.name != "none"
+    keeps_state, of_states = auxiliary.weighting.name != "none", bool(networks.critic_state_size)
 
     def prepare(working: WorkingState, batch: Batch) -> PreparedBatch:
         image = None
@@ -260,41 +236,33 @@ def make_ddpg(
         return PreparedBatch(batch, networks.prepare_batch(working.scaling, batch), image)
 
     def gradients(working: WorkingState, prepared: PreparedBatch, with_actor: bool = True) -> tuple[Gradients, Metrics]:
-        agent, (batch, inputs, image, noise) = working.agent, prepared
+        agent, batch = working.agent, prepared.batch
         copies = ComputeCopies(*map(networks.with_compute_copy, _network_parameters(agent), working.copies))
         rewarded = None
         if learned_reward is not None:
-            rewarded = learned_reward.of_batch(agent.reward_model, working.scaling.observations, inputs, batch)
+            rewarded = learned_reward.of_batch(agent.reward_model, working.scaling.observations, prepared.inputs, batch)
         if rewarded is not None:
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None
-        state = auxiliary.start(copies.critic) if agent.weighting is None else agent.weighting
-        weighted = learning.critic_gradient(copies, inputs, image, batch, noise)(copies.critic, state)
-        latents, value, keep = weighted.extra
+        state = auxiliary.start(copies.actor if of_states else copies.critic) if agent.weighting is None else agent.weighting
+        compute = network_gradients.critic_of_states if of_states else network_gradients.critic_of_images
+        found = compute(learning, copies, prepared._replace(batch=batch), state, with_actor)
+        metrics, mean_square = found.metrics, None if found.action is None else jnp.mean(jnp.square(found.action))
         counts = diagnostics.count_rewards(
-            batch.reward, keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
+            batch.reward, found.keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
         )
-        metrics = _loss_metrics(weighted, value)
-        actor_gradient, mean_square = None, None
-        if with_actor:
-            (policy_loss, action), actor_gradient = jax.value_and_grad(learning.actor_loss, has_aux=True)(
-                copies.actor, copies.critic, inputs, latents, image, batch, weighted.weights
-            )
-            actor_gradient = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), actor_gradient)
-            metrics["train/actor_loss"], mean_square = policy_loss, jnp.mean(jnp.square(action))
         if learned_reward is not None and rewarded is not None:
             metrics[f"train/{learned_reward.name}_loss"] = rewarded.loss
         of_model = rewarded.gradient if rewarded is not None else None
         # Average everything that was not reduced earlier over the shards of a learner, in one all-reduce.
-        own_gradient = None if learning.reduces_early else weighted.gradient
-        own_gradient, actor_gradient, of_model, metrics, mean_square, counts = shards.mean(
-            (own_gradient, actor_gradient, of_model, metrics, mean_square, counts)
-        )
+        own = {"critic": found.critic, "actor": found.actor}
+        reduced = own.pop("actor" if of_states else "critic") if learning.reduces_early else None
+        own, of_model, metrics, mean_square, counts = shards.mean((own, of_model, metrics, mean_square, counts))
         if mean_square is not None:
             metrics["train/action_size"] = jnp.sqrt(mean_square)
         metrics |= {f"train/{name}": fraction for name, fraction in diagnostics.fractions(counts, shards.count).items()}
-        critic_gradient = weighted.gradient if own_gradient is None else own_gradient
-        return Gradients(critic_gradient, actor_gradient, weighted.state if keeps_state else None, of_model), metrics
+        critic, actor = own.get("critic", reduced), own.get("actor", reduced)
+        return Gradients(critic, actor, found.weighting if keeps_state else None, of_model), metrics
 
     def apply(working: WorkingState, chosen: Gradients) -> WorkingState:
         counts = working.counts + jnp.array([1, int(chosen.actor is not None), 1])

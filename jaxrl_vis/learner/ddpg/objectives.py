@@ -6,8 +6,10 @@ encodes those that it needs in one pass:
     critic, actor (online, with gradient)   before, goal, and for auxiliary tasks after, views
     their targets                           goal, after
 
-The actor's loss evaluates its actions on the latents from the critic's forward pass, without a gradient through these. With
-``critic_states``, the critic's heads also read the true states, which the actor never observes.
+The actor's loss evaluates its actions on the latents from the critic's forward pass, without a gradient through these.
+
+With ``critic_states``, the critic reads true states and encodes nothing; auxiliary losses are then those of the actor's
+encoder, and weighted against the actor's main loss.
 """
 
 import dataclasses
@@ -87,7 +89,7 @@ _MAIN_READS, _OTHERS_READ = "main", "others"
 
 
 def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[str, Callable[[Params], jax.Array]]:
-    """Return functions from encoder parameters to the latents of the critic's main loss, and to those of auxiliary losses.
+    """Return functions from encoder parameters to the latents of the main loss, and to those of auxiliary losses.
 
     Only the main loss reads goals, so separate encodings shorten the backward passes of auxiliary losses.
     """
@@ -117,10 +119,12 @@ def _next_latents(networks: Networks, copies: ComputeCopies, inputs: Inputs, lat
         after = latents.after
         after = _encode(networks, copies.critic, inputs, "after") if after is None else after[None]
         of_critic = jnp.concatenate([after, latents.pair[1:]])
-    if networks.config.network.encoders == "shared":
-        return of_critic, of_critic
-    of_actor = _encode(networks, networks.with_encoder(copies.target_actor, copies.actor), inputs, "goal", "after")[::-1]
-    return of_actor, of_critic
+    return of_critic if networks.shares_encoder else _next_actor_latents(networks, copies, inputs), of_critic
+
+
+def _next_actor_latents(networks: Networks, copies: ComputeCopies, inputs: Inputs) -> jax.Array:
+    """Encode next observations and goals for the target actor, [2, B, latent], by an encoder of its own."""
+    return _encode(networks, networks.with_encoder(copies.target_actor, copies.actor), inputs, "goal", "after")[::-1]
 
 
 def _minimum(values: jax.Array) -> jax.Array:
@@ -148,7 +152,7 @@ class Objectives:
 
     @property
     def reduces_early(self) -> bool:
-        """True if the critic's gradients are averaged over the shards of a learner before they are weighted.
+        """True if gradients with auxiliary losses are averaged over the shards of a learner before they are weighted.
 
         A weighting that reads losses or compares gradients needs those of the whole learner. Other weightings are linear, so
         their result can be averaged afterwards, together with everything else.
@@ -163,21 +167,54 @@ class Objectives:
 
         All heads are trained on the same target; ``values`` are the minimum over heads. ``noise`` as for `_target`.
         """
-        networks, weighting, mode = self.networks, self.auxiliary.weighting, self.auxiliary.gradient_mode
-
-        def encode(encoder: Params) -> Latents:
-            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, separately=mode == "per_loss")
+        networks = self.networks
 
         def critic_losses(critic: Params, encoded: Latents | dict[str, jax.Array]):
             assert batch.reward is not None
             latents = _collect_latents(self.auxiliary, encoded)
-            target = self._target(copies, inputs, latents, batch, noise)
-            values = networks.values(critic, latents.pair, batch.action, inputs.states_t)
-            value = _minimum(values)
-            keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
-            others = self._auxiliary(critic, latents, inputs, image, batch)
-            errors = [losses.critic_loss(of_head, target, keep, self._kept_mean(keep)) for of_head in values]
-            return {MAIN: functools.reduce(jnp.add, errors), **others}, (latents, value, keep)
+            of_actor, of_critic = _next_latents(networks, copies, inputs, jax.lax.stop_gradient(latents))
+            target = self._target(copies, of_actor, of_critic, batch, noise)
+            main, value, keep = self._error(networks.values(critic, latents.pair, batch.action), target, batch)
+            return {MAIN: main, **self._auxiliary(critic, latents, inputs, image, batch)}, (latents, value, keep)
+
+        return self._weighted_grad(critic_losses, inputs)
+
+    def critic_error_on_states(
+        self, critic: Params, copies: ComputeCopies, inputs: Inputs, batch: Batch, noise: jax.Array | None = None
+    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        """Compute the loss [] of a critic that observes true states; and (values [B], keep [B]) as in `critic_gradient`."""
+        target = self._target(copies, _next_actor_latents(self.networks, copies, inputs), inputs.states_tp1, batch, noise)
+        main, value, keep = self._error(self.networks.values(critic, inputs.states_t, batch.action), target, batch)
+        return main, (value, keep)
+
+    def actor_gradient(
+        self, critic: Params, inputs: Inputs, image: jax.Array | None, batch: Batch
+    ) -> Callable[[Params, WeightingState], Weighted]:
+        """Build the function that computes the losses and the gradient of an actor whose critic observes true states.
+
+        ``extra`` are the actions [B, A]. The main loss is that of `actor_loss`; for a logarithm, it is raised by the maximum
+        value, so that it is positive.
+        """
+
+        def actor_losses(actor: Params, encoded: Latents | dict[str, jax.Array]):
+            latents = _collect_latents(self.auxiliary, encoded)
+            action = self.networks.act(actor, latents.pair)
+            value = self.networks.value(critic, inputs.states_t, action)
+            main = losses.actor_loss(value, action, self.config.ddpg.action_penalty)
+            if self.auxiliary.weighting.log:
+                main = main + self._maximum_value
+            return {MAIN: main, **self._auxiliary(actor, latents, inputs, image, batch)}, action
+
+        return self._weighted_grad(actor_losses, inputs)
+
+    def _weighted_grad(
+        self, network_losses: Callable[..., Any], inputs: Inputs
+    ) -> Callable[[Params, WeightingState], Weighted]:
+        """Build the weighted gradient of (parameters of a network, `Latents` or pieces of them) -> (losses by name, extra)."""
+        networks, weighting, mode = self.networks, self.auxiliary.weighting, self.auxiliary.gradient_mode
+
+        def encode(encoder: Params) -> Latents:
+            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, separately=mode == "per_loss")
 
         # If losses are differentiated one by one, auxiliary losses need not pass through everything that the main one reads.
         passes_apart = mode == "latents" and weighting.needs in ("dots", "gramian")
@@ -185,7 +222,20 @@ class Objectives:
         options: dict[str, Any] = {"forwards": forward_mode.with_tangents, "encode": encoders, "has_aux": True}
         if self.reduces_early:
             options["reduce"] = self.shards.mean
-        return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), mode, **options)
+        return weighted_grad(network_losses, weighting, lambda params: params.get("encoder"), mode, **options)
+
+    @property
+    def _maximum_value(self) -> float:
+        """Maximum return, R+/(1-gamma)."""
+        return self.resolved.reward_positive / (1.0 - self.resolved.discount)
+
+    def _error(self, values: jax.Array, target: jax.Array, batch: Batch) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Compute the critic's loss [] over all heads, their minimum [B], and the mask [B] of unfiltered transitions."""
+        assert batch.reward is not None
+        value = _minimum(values)
+        keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
+        errors = [losses.critic_loss(of_head, target, keep, self._kept_mean(keep)) for of_head in values]
+        return functools.reduce(jnp.add, errors), value, keep
 
     def _kept_mean(self, keep: jax.Array) -> jax.Array | None:
         """Return the mean number of unfiltered transitions per shard, the divisor for all; None if each divides by its own."""
@@ -194,16 +244,22 @@ class Objectives:
         return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
 
     def _target(
-        self, copies: ComputeCopies, inputs: Inputs, latents: Latents, batch: Batch, noise: jax.Array | None
+        self, copies: ComputeCopies, of_actor: jax.Array, of_critic: jax.Array, batch: Batch, noise: jax.Array | None
     ) -> jax.Array:
-        """Compute the critic's targets [B]; ``noise`` [B, A], unless None, is added to the next actions."""
+        """Compute the critic's targets [B].
+
+        Args:
+            copies: Parameters of the networks.
+            of_actor, of_critic: What the target actor and the target critic read after the transition (`Networks.values`).
+            batch: Transitions with rewards.
+            noise: [B, A], added to the next actions; None for no noise.
+        """
         assert batch.reward is not None
-        networks, resolved = self.networks, self.resolved
-        of_actor, of_critic = _next_latents(networks, copies, inputs, jax.lax.stop_gradient(latents))
-        action = networks.act(copies.target_actor, of_actor)
+        resolved = self.resolved
+        action = self.networks.act(copies.target_actor, of_actor)
         if noise is not None:
             action = jnp.clip(action + noise, -1.0, 1.0)
-        value_tp1 = _minimum(networks.values(copies.target_critic, of_critic, action, inputs.states_tp1))
+        value_tp1 = _minimum(self.networks.values(copies.target_critic, of_critic, action))
         discount = resolved.discount if batch.discount is None else batch.discount
         return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
 
@@ -221,7 +277,7 @@ class Objectives:
 
         An actor with an encoder of its own also has auxiliary losses, with the critic's ``weights``, [] float32 by name.
         """
-        has_encoder = self.config.network.encoders == "separate"
+        has_encoder = not self.networks.shares_encoder
         latents, others = critic_latents, {}
         if has_encoder:
             latents = _encode_online(self.networks, self.auxiliary, actor, inputs, separately=False)
@@ -229,8 +285,8 @@ class Objectives:
         if self.auxiliary.weighting.log:
             others = {name: self.shards.global_mean(loss) for name, loss in others.items()}
         action = self.networks.act(actor, self.auxiliary.main_latents(latents.pair, weights) if has_encoder else latents.pair)
-        value = self.networks.value(critic, critic_latents.pair, action, inputs.states_t)
-        best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
+        value = self.networks.value(critic, critic_latents.pair, action)
+        best = self._maximum_value if self.auxiliary.weighting.log else None
         loss = losses.actor_loss(
             value, action, self.config.ddpg.action_penalty, best, self.shards.global_mean, self.config.ddpg.actor_log
         )

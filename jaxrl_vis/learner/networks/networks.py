@@ -49,7 +49,7 @@ class BatchScaling(NamedTuple):
 _OBSERVED = ("before", "goal", "after")  # in the order of `Inputs.observed`
 
 Piece = tuple[jax.Array, slice]
-"""Slice of an array of prepared observations: the array [B, ...], and the slice along its first axis."""
+"""Rows of an array of prepared observations: the array (3 B rows of `Inputs.observed`, or B of a view), and their slice."""
 
 
 class Inputs(NamedTuple):
@@ -67,14 +67,16 @@ class Inputs(NamedTuple):
     states: jax.Array | None = None
 
     @property
-    def states_t(self) -> jax.Array | None:
-        """True states [B, P] before the action, and of the goal; None if there are none."""
-        return None if self.states is None else self.states[0]
+    def states_t(self) -> jax.Array:
+        """True states [B, P] before the action, and of the goal, of a critic that observes them."""
+        assert self.states is not None
+        return self.states[0]
 
     @property
-    def states_tp1(self) -> jax.Array | None:
-        """True states [B, P] after the action, and of the goal; None if there are none."""
-        return None if self.states is None else self.states[1]
+    def states_tp1(self) -> jax.Array:
+        """True states [B, P] after the action, and of the goal, of a critic that observes them."""
+        assert self.states is not None
+        return self.states[1]
 
     @property
     def size(self) -> int:
@@ -105,7 +107,8 @@ class Networks:
         action_size: A.
         critic_output_bias: Initial bias of the critic's output.
         critic_heads: K, number of heads of the critic on one encoder. With several, their parameters have a leading axis [K].
-        critic_state_size: P, size of the true states that the critic's heads also read; 0 for none.
+        critic_state_size: P, size of the true states that the critic observes instead of images; 0 if it observes what the
+            actor observes.
     """
 
     config: Config
@@ -145,6 +148,11 @@ class Networks:
     def sees_images(self) -> bool:
         """True if observations are planar images rather than state vectors."""
         return len(self.observation_spec.shape) == 3
+
+    @property
+    def shares_encoder(self) -> bool:
+        """True if the actor uses the critic's encoder."""
+        return self.config.network.encoders == "shared" and not self.critic_state_size
 
     @property
     def uses_kernel(self) -> bool:
@@ -192,14 +200,13 @@ class Networks:
 
     def init_actor(self, key: jax.Array) -> Params:
         """Initialise the actor, {"encoder": ..., "head": ...}: without an encoder for states, or if it shares the critic's."""
-        has_encoder = self.config.network.encoders == "separate"
-        return self._init(key, self.head(self.action_size, 0.0), 2 * self.latent_size, has_encoder=has_encoder)
+        return self._init(key, self.head(self.action_size, 0.0), 2 * self.latent_size, has_encoder=not self.shares_encoder)
 
     def init_critic(self, key: jax.Array) -> Params:
         """Initialise the critic, {"encoder": ..., "head": ...}: without an encoder for states; heads are stacked [K, ...]."""
         head = self.head(1, self.critic_output_bias)
-        width = 2 * self.latent_size + self.action_size + self.critic_state_size
-        critic = self._init(key, head, width)
+        width = self.action_size + (self.critic_state_size or 2 * self.latent_size)
+        critic = self._init(key, head, width, has_encoder=not self.critic_state_size)
         if self.critic_heads == 1:
             return critic
         keys = jax.random.split(jax.random.fold_in(key, _FURTHER_HEADS), self.critic_heads - 1)
@@ -306,24 +313,24 @@ class Networks:
         """Compute actions [B, A] float32 in [-1, 1] from latents [2, B, latent] of observations and goals."""
         return jnp.tanh(self.head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
 
-    def values(self, critic: Params, latents: jax.Array, action: jax.Array, states: jax.Array | None = None) -> jax.Array:
-        """Compute each head's values [K, B] float32 of actions [B, A]; latents [2, B, latent] as for `act`.
+    def values(self, critic: Params, observed: jax.Array, action: jax.Array) -> jax.Array:
+        """Compute each head's values [K, B] float32 of actions [B, A].
 
-        ``states`` [B, P] are normalised true states (`Inputs.states`); None if the critic does not observe them.
+        ``observed`` are latents [2, B, latent] as for `act`, or normalised true states [B, P] (`Inputs.states`) for a critic
+        that observes these.
         """
         if self.critic_heads == 1:
-            return self._value(critic["head"], latents, action, states)[None]
-        return jax.vmap(self._value, (0, None, None, None))(critic["head"], latents, action, states)
+            return self._value(critic["head"], observed, action)[None]
+        return jax.vmap(self._value, (0, None, None))(critic["head"], observed, action)
 
-    def value(self, critic: Params, latents: jax.Array, action: jax.Array, states: jax.Array | None = None) -> jax.Array:
+    def value(self, critic: Params, observed: jax.Array, action: jax.Array) -> jax.Array:
         """Compute the first head's values [B] float32; arguments as for `values`."""
         head = critic["head"]
         first = head if self.critic_heads == 1 else jax.tree.map(lambda leaf: leaf[0], head)
-        return self._value(first, latents, action, states)
+        return self._value(first, observed, action)
 
-    def _value(self, head: Params, latents: jax.Array, action: jax.Array, states: jax.Array | None) -> jax.Array:
-        inputs = (latents, action) if states is None else (latents, action, states)
-        return self.head(1, self.critic_output_bias).apply({"params": head}, *inputs)[..., 0]
+    def _value(self, head: Params, observed: jax.Array, action: jax.Array) -> jax.Array:
+        return self.head(1, self.critic_output_bias).apply({"params": head}, observed, action)[..., 0]
 
 
 def _with_goals(batch: Batch) -> jax.Array:

@@ -105,14 +105,13 @@ def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episod
     batch = Batch(jnp.stack([before, goals, after]), actions, nothing, nothing)
     batch = auxiliary.with_targets(key, batch, episode.stored)
     names = ("before", "after", *batch.views)
-    inputs = networks.prepare_batch(networks.batch_scaling(train.statistics), batch)
-    latents = networks.encode_pieces(train.agent.critic, inputs.pieces(*names))
+    inputs = networks.prepare_batch(networks.batch_scaling(train.statistics._replace(states=None)), batch)
+    params = train.agent.actor if networks.critic_state_size else train.agent.critic
+    latents = networks.encode_pieces(params, inputs.pieces(*names))
     latent_t, latent_tp1, *view_latents = latents.reshape(len(names), count, networks.config.network.latent_size)
     image = networks.normalize(networks.scaling(train.normalizer), before) if auxiliary.needs_image else None
     view = View(latent_t, actions, latent_tp1, image)
-    predicted = auxiliary.predictions(
-        train.agent.critic["heads"], view, dict(zip(batch.views, view_latents, strict=True)), batch
-    )
+    predicted = auxiliary.predictions(params["heads"], view, dict(zip(batch.views, view_latents, strict=True)), batch)
     fields: dict[str, Any] = {}
     if "autoencoder" in predicted:
         fields["reconstruction"] = _as_image(networks, train, predicted["autoencoder"])
