@@ -30,7 +30,7 @@ EVALUATION_SEED = 10_000
 
 
 def evaluate(env: str, act: Callable[[dict[str, np.ndarray]], np.ndarray]) -> dict[str, float]:
-    """Evaluate a policy, from dictionaries of observations and goals [N, ...] to actions [N, A], on `EVALUATION_EPISODES` episodes.
+    """Evaluate a policy, a function from dictionaries of observations and goals [N, ...] to actions [N, A].
 
     Returns:
         Mean ``success`` and ``goal_distance`` (in the task's unit) at the last step.
