@@ -135,7 +135,7 @@ def _first_move(observations: np.ndarray) -> np.ndarray:
 
 
 def finger_turn(recording: Recording) -> list[Figure]:
-    """Compare final joint angles with K physics steps per control step, for each recorded K; only 21, the task's, is bounded."""
+    """Compare final joint angles with K physics steps per control step, for each recorded K; only the task's 21 is bounded."""
     figures = []
     for substeps in (21, 2):
         keys = (f"qpos_rad_nsub{substeps}", f"qvel_rad_s_nsub{substeps}")

@@ -88,7 +88,7 @@ def losses_of(params: Any, features: jax.Array, batch: dict[str, jax.Array]) -> 
 
 
 def time_call(function: Callable[..., Any], arguments: tuple[Any, ...], repeats: int) -> float:
-    """Return the median time of a call, s, without compilation, of up to ``repeats`` timings, at least three, within `BUDGET`."""
+    """Return the median time of a call, s, without compilation: of three timings, or up to ``repeats`` within `BUDGET`."""
     call = jax.jit(function)
     jax.block_until_ready(call(*arguments))
     seconds, end = [], time.perf_counter() + BUDGET

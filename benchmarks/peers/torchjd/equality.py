@@ -39,8 +39,8 @@ def cagrad_loss(jacobian: np.ndarray, weights: np.ndarray) -> float:
     """Return the shortfall of the worst slope from the dual bound, relative to the mean gradient's squared norm.
 
     The dual is evaluated at the weights within the convex hull. An excess of the step over CAGrad's radius, relative to the
-    radius, is added. The result is 0 for weights of 0, which stand for a stationary point, and
-    for weights that sum to 1, which do not determine the dual's.
+    radius, is added. The result is 0 for weights of 0, which stand for a stationary point, and for weights that sum to 1, which
+    do not determine the dual's.
     """
     mean = jacobian.mean(axis=0)
     radius, step = CAGRAD_RADIUS * np.linalg.norm(mean), weights @ jacobian
