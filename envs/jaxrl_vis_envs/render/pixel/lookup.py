@@ -38,7 +38,16 @@ class TextureRow(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Properties of one object, or of the object at each pixel: scalars, or arrays [P] float32."""
+    """Properties of one object, or of the object at each pixel: scalars, or arrays [P] float32.
+
+    Attributes:
+        axes, origin, extra: As in `shapes.UnitShapes`.
+        kind: Type, a `mujoco.mjtGeom`.
+        colour: Red, green and blue.
+        emission, specular: Coefficients of the material.
+        exponent: Exponent of highlights, 128 times the shininess.
+        texture: Texture mapping; None in a scene without textures.
+    """
 
     axes: Vector  # of three vectors
     origin: Vector
