@@ -30,7 +30,7 @@ def can_blend(scene: Scene) -> bool:
 
 
 def sheet_rows(scene: Scene) -> list[int]:
-    """Return the rows of the transparent objects, in the order in which the model declares them."""
+    """Return the indices of the transparent objects, in the order in which the model declares them."""
     rows = [row for row, clear in enumerate(scene.transparent) if clear]
     return sorted(rows, key=lambda row: scene.object_ids[row])
 
@@ -52,7 +52,7 @@ def face(
         unit: Rendered objects.
         table: `lookup.object_table`.
         light_table: Lights, from `lights.pack`.
-        row: Row of the object.
+        row: Index of the object.
         rays: [P].
         own: [P] int32, keys of the object.
         key: [P] int32, keys of the nearest opaque objects.
@@ -67,7 +67,7 @@ def face(
 
 
 def blend(scene: Scene, unit: shapes.UnitShapes, faces: tuple[jax.Array, ...], colour: jax.Array) -> jax.Array:
-    """Blend the faces of all `sheet_rows` over packed colours [P] int32."""
+    """Blend the faces of all `sheet_rows` over packed colours [P] int32; return packed colours."""
     rows = sheet_rows(scene)
     mixed: Any = unpack_channels(colour, BITS)
     order = jnp.argsort(unit.distance[np.array(rows)])  # stable
