@@ -279,6 +279,9 @@ def measure_in_processes(
         comparisons: Configurations to be repeated, all on the same number of devices.
         positions: Index of each among all configurations.
         times: Times of an iteration of each by one process, s.
+
+    Raises:
+        SystemExit: A process failed.
     """
     with socket.socket() as free:
         free.bind(("localhost", 0))

@@ -85,7 +85,8 @@ class VisualHandReachConfig(PixelsConfig, HandReachConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.7, 0.96)
-    """Depths encoded as 0 and 255, m: 1 mm per step, from above upright fingers to below the lowest knuckle."""
+    """Depths encoded as 0 and 255, m: 1 mm per step, from above upright fingers to below the lowest knuckle. Only for
+    ``depth_encoding="metric"``."""
     clip_range: tuple[float, float] = (0.0124, 62.0)
     """Near and far clipping planes of the release, m. Only for ``depth_encoding="zbuffer"``."""
     view: View = "palm"
