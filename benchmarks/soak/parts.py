@@ -135,7 +135,7 @@ class RunProcess:
             self.lines.append(line.rstrip())
 
     def wait(self, seconds: float = 240.0) -> int:
-        """Wait for the process and its last line; return its exit status.
+        """Wait for the process and its last line, and store its output in `LAST`; return its exit status.
 
         Raises:
             Broken: The process does not end in time; it is killed.

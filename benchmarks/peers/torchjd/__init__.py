@@ -5,7 +5,7 @@
     python -m benchmarks.peers.torchjd cost --python torchjd/bin/python        time on one device, in one call
 
 jacobians   random Jacobians of all ranks, and the random numbers of random methods
-ours, peer  results of either side; `peer` imports only PyTorch and TorchJD, and is run as a script
-equality    differences, and residuals of each side's solution of the method's problem
+ours, peer  results of either library; `peer` imports only PyTorch and TorchJD, and is run as a script
+equality    differences, and residuals of each library's solution of the method's problem
 cost        time of a step for 2 to 16 losses; `peer_cost`: TorchJD's
 """

@@ -1,4 +1,4 @@
-"""Differences between the results of both sides, and how well each solves the problem that a method's paper states.
+"""Differences between the results of both libraries, and how well each solves the problem that a method's paper states.
 
 Jacobians are [K, P] float64 for K losses and P parameters, weights [K] float64.
 """

@@ -60,7 +60,7 @@ class HandReachConfig(TaskConfig):
     goal_actions: int = 20
     """Number of random actions that generate a goal, with ``goal_rule="random_actions"``."""
     goal_noise: float = 5.0
-    """Standard deviation of the Gaussian noise added to each of these uniform actions before clipping to [-1, 1]."""
+    """Standard deviation of the Gaussian noise added to each of the uniform ``goal_actions`` before clipping to [-1, 1]."""
     substeps: int = 20
     """Physics steps per control step of 40 ms (20 gives the original's 2 ms; 10 adds .1 mm of error at the tips)."""
     goal_substeps: int = 10

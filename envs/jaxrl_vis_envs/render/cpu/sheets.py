@@ -21,7 +21,11 @@ _MAX_SHEETS = 8
 
 
 def can_blend(scene: Scene) -> bool:
-    """Return True if the scene's transparent objects are few primitives, without alpha in their textures."""
+    """Return True if `blend` supports the scene.
+
+    Its transparent objects must be few primitives that are transparent from all sides, without alpha in their textures, and
+    the keys must contain the rows (`raycast.has_separate_rows`).
+    """
     rows = sheet_rows(scene)
     fine = (shapes.MESH, shapes.HFIELD)
     simple = [scene.transparent[row] == reading.CLEAR and scene.object_types[row] not in fine for row in rows]
