@@ -5,6 +5,7 @@
     claims/       tables of the learning studies and claims of the thesis; check_claims.py also checks sentences
     parity.py     tasks against recordings of the originals, made by record_originals.py
     rendering/    the renderer against MuJoCo's own, with render_parity.py
+    pixels/       image observations for environments of MuJoCo Playground: parity, speed and training
     tasks/        solvability, difficulty, goal images and physics of the tasks
     profiling/    kernels, rollouts and the cost of weighting; startup_time.py
     stalks/       phenotyping and grasping: speed and accuracy

@@ -114,7 +114,7 @@ def calls() -> list[str]:
 
 
 def measure(with_calls: bool = True) -> dict[str, Any]:
-    """Compute all figures by name; counts exclude the stalks product unless their names say otherwise.
+    """Compute all figures by name; all but "fullest folder" and "lines of the stalks" exclude the stalks product.
 
     Args:
         with_calls: Whether to include the calls to the critic's loss, which takes some seconds.

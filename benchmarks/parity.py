@@ -50,7 +50,7 @@ class Figure(NamedTuple):
 
 
 class NothingToCompareError(ValueError):
-    """The recording lacks an array or has wrong shapes, or the task has no known recordings."""
+    """Error of a recording that lacks an array or has wrong shapes, or of a task without known recordings."""
 
 
 def play(env: Any, state: State, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,7 +68,7 @@ def play(env: Any, state: State, actions: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def distance_figures(name: str, error: np.ndarray, median: float | None, high: float | None, percentile: int) -> list[Figure]:
-    """Return the median and a high percentile of ``error`` [...] (m), with their bounds (m)."""
+    """Return the median and a percentile of ``error`` [...], with their bounds ``median`` and ``high``, None for none; m."""
     return [
         Figure(f"{name}: median error", float(np.median(error)), "m", median),
         Figure(f"{name}: {percentile}th percentile of the error", float(np.percentile(error, percentile)), "m", high),
@@ -135,7 +135,7 @@ def _first_move(observations: np.ndarray) -> np.ndarray:
 
 
 def finger_turn(recording: Recording) -> list[Figure]:
-    """Compare joint angles with K physics steps per control step, for each recorded K. Only 21, the task's own, is bounded."""
+    """Compare final joint angles with K physics steps per control step, for each recorded K; only the task's 21 is bounded."""
     figures = []
     for substeps in (21, 2):
         keys = (f"qpos_rad_nsub{substeps}", f"qvel_rad_s_nsub{substeps}")

@@ -88,6 +88,9 @@ class Timed:
 
         A cycle consists of the iterations between two evaluations. As in a run, the host reads the metrics of each iteration
         during the next one, and those of a cycle's last iteration during the evaluation, which it then waits for.
+
+        Raises:
+            FloatingPointError: A metric is not finite.
         """
         programs, count = self.programs, self.config.run.eval_interval
         loop = programs.init(programs.run_keys) if self.loop is None else self.loop
@@ -276,6 +279,9 @@ def measure_in_processes(
         comparisons: Configurations to be repeated, all on the same number of devices.
         positions: Index of each among all configurations.
         times: Times of an iteration of each by one process, s.
+
+    Raises:
+        SystemExit: A process failed.
     """
     with socket.socket() as free:
         free.bind(("localhost", 0))

@@ -50,9 +50,10 @@ def commit_time(checkout: Path) -> int:
 
 
 def export(checkout: Path, folder: Path) -> None:
-    """Write the files of the last commit into a folder, created if necessary, so that a release has committed files only.
+    """Write the files of the last commit into a new folder, so that a release has committed files only.
 
     Raises:
+        FileExistsError: The folder exists.
         subprocess.CalledProcessError: git failed.
     """
     folder.mkdir(parents=True)

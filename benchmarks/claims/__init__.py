@@ -4,7 +4,7 @@
     columns      statistics of a record as cells of a table
     ol_aux       tables of the study of auxiliary losses (figures 5.4 to 5.7)
     indicator    tables of the study of rewards without ground truth (figures 5.1, 5.2, estimators, cameras)
-    ablations    tables of single runs with one option changed
+    ablations    tables of runs with a few options changed
     thesis       claims of the thesis compared with the records, for docs/claims.md and, abridged, the README
     prose        comparison of sentences that quote numbers with their pages
     sentences    these sentences, with computed numbers

@@ -1,4 +1,4 @@
-"""Tables of single runs with one option changed: docs/lab/learner_options.md, docs/lab/weightings_fast.md, docs/learner.md."""
+"""Tables of runs with a few options changed: docs/lab/learner_options.md, docs/lab/weightings_fast.md, docs/learner.md."""
 
 from collections.abc import Sequence
 

@@ -88,7 +88,7 @@ def authors(task: str, variant: str, budget: int) -> Record:
 
 
 def show_seeds(record: Record) -> str:
-    """Format the first and last seed; empty for a published curve."""
+    """Format the first and last seed, or the only one; empty for a published curve."""
     if _source(record) == AUTHORS:
         return ""
     return f"{record.seeds[0]} to {record.seeds[-1]}" if len(record.seeds) > 1 else str(record.seeds[0])
@@ -220,7 +220,7 @@ def training_mean(metric: str, title: str, digits: int = 3) -> Column:
 
 
 def mean_success(budget: int | None = None) -> Column:
-    """Return the column of the interquartile mean over seeds of the mean success, with 95 % bootstrap interval.
+    """Return the column of the interquartile mean of the mean success, with 95 % bootstrap interval; empty for one seed.
 
     Args:
         budget: Environment steps up to which success is averaged; None for all.
@@ -269,7 +269,7 @@ def final_precision() -> Column:
 def distance_to_authors(task: str, variant: str) -> Column:
     """Return the column of the mean absolute difference between the median success and the authors' released curve.
 
-    With its 95 % bootstrap interval over seeds; empty for the authors' curve itself.
+    The 95 % bootstrap interval over seeds is added in parentheses. The cell of the authors' own curve is empty.
     """
     curve = released_curves()[task, variant]
 
@@ -291,7 +291,7 @@ def _resampled_medians(record: Record, count: int = 2_000) -> list[list[tuple[in
 
 
 def names() -> Column:
-    """Return the column of the record's path below benchmarks/results, without the folder named by the page."""
+    """Return the column of the record's path below benchmarks/results without its first folder; empty for a published curve."""
     return Column("record", lambda record: "" if _source(record) == AUTHORS else f"`{record.name.partition('/')[2]}`")
 
 

@@ -58,7 +58,11 @@ def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, extr
 
 
 def _rewards(task: str, precision: bool) -> str:
-    """Return the table of logged reward statistics, over training and at the end."""
+    """Return the table of logged reward statistics of all methods, over training and at the end.
+
+    With ``precision``, these are the dropped negatives and the filter's precision, otherwise positive rewards and the value
+    at goals; false negatives are in both.
+    """
     pairs = [("positive rewards", "train/positive_share"), ("negatives that are false", "train/false_negative_share")]
     if precision:
         pairs = [("negatives dropped", "train/filtered_share"), pairs[1]]

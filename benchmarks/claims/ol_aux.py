@@ -128,7 +128,7 @@ def _departures() -> str:
 
 
 def _gaps() -> str:
-    """Return the table of runs with one departure from the authors' release undone, on hand and finger."""
+    """Return the table of runs with one or more departures from the authors' release undone, on hand and finger."""
     hand = [
         ("VisualHandReach, `paper`", run(HAND, "none")),
         ("the z-buffer", ablation("hand_paper_zbuffer")),

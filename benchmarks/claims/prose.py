@@ -34,12 +34,12 @@ OTHERS: dict[str, tuple[str, ...]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Sentence:
-    """Part of a sentence.
+    """Part of a sentence that quotes numbers or verdicts of a record.
 
     Attributes:
         page: Page below the root.
         quote: Text with the computed numbers.
-        record: Source of the numbers.
+        record: Name of the record that they come from, for messages.
         holds: True if the records support the text.
     """
 

@@ -49,7 +49,7 @@ class Record:
         return curve(self.rows, SUCCESS)
 
     def steps_to(self, level: float) -> int | None:
-        """Return the first environment steps whose evaluation and the next two reach a level, in the median over seeds."""
+        """Return the environment steps of the first of 3 consecutive evaluations whose medians reach ``level``, or None."""
         return steps_to(self.points, level)
 
     def at(self, steps: int, metric: str = SUCCESS) -> np.ndarray | None:
@@ -158,7 +158,7 @@ def fresh_variants(task: str) -> list[str]:
 
 
 def _folders(family: str, stem: str) -> dict[int, Path]:
-    """Return the folder of the longest run by its first seed."""
+    """Return the folder of the longest run of a study by first seed; {} if there are none."""
     longest: dict[int, tuple[int, Path]] = {}
     for folder in (RESULTS / "studies" / family).glob(f"{stem}-seeds*"):
         match = re.fullmatch(rf"{re.escape(stem)}-seeds(\d+)to\d+(?:-.*)?", folder.name)

@@ -156,7 +156,7 @@ def with_decay(task: str, variant: str, decay: float) -> Record:
 
 
 def speed_up(task: str, level: float, decay: float) -> str:
-    """Format the speed-up of OL-AUX-5 over none to a success level, both with the same decay of the target networks."""
+    """Format the speed-up of OL-AUX-5 to a success level, over no auxiliary losses; ``decay`` is that of target networks."""
     return c.speed_up(with_decay(task, "ol_aux_5", decay), with_decay(task, "none", decay), level)
 
 

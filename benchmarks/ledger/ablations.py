@@ -4,7 +4,8 @@ name        unique name of the curve
 task        environment
 preset      preset of the revision
 options     options that the docs state for the curve, with remarks in parentheses; null if they state none
-revision    measured revision, device: measured device; null if the docs state none
+revision    measured revision; null if the docs state none
+device      measured device; null if the docs state none
 page        page of docs that quotes the curve, or null
 stored      commit that stored the curve, an upper bound of the revision
 metrics     columns of metrics.jsonl: name -> values, one per seed and evaluation

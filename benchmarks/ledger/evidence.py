@@ -48,7 +48,7 @@ def keep_run(run: Path, name: str, results: Path) -> tuple[Path, Path]:
         results: Folder of records; the evidence goes into `FOLDER` below it.
 
     Returns:
-        Paths of the two files.
+        Paths of the record and of the file of its rows.
 
     Raises:
         RequestError: There is no run, or it has no evaluation.

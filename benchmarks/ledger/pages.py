@@ -110,10 +110,10 @@ def write_pages(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[
 
 
 def outdated(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[str]:
-    """Yield a complaint for every page whose tables differ from the records.
+    """Yield a complaint for every page whose tables differ from the records or cannot be written; missing pages are skipped.
 
     Raises:
-        RequestError: There is no folder of records, or a file in it cannot be read.
+        RequestError: A record of the learning studies cannot be read.
     """
     for name, of_page in writers(results).items():
         page = checkout / name

@@ -2,8 +2,8 @@
 
 Every benchmark lists the files that it measures. A record is stale if one of them has a definition (a function, a class or
 another top-level statement; the whole contents of a file that is not Python) that did not exist anywhere at the record's
-revision. Moved and renamed files, comments, docstrings, annotations, imports and error messages therefore do not count. A
-renamed variable does: only a new measurement can show that it changed no figure.
+revision. Moved and renamed files, comments, docstrings, annotations of functions, imports and error messages therefore do not
+count. A renamed variable does: only a new measurement can show that it changed no figure.
 """
 
 import ast

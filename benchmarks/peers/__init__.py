@@ -7,5 +7,6 @@
     python -m benchmarks.peers.torchjd      loss weightings compared with TorchJD's: equality and cost
     python -m benchmarks.peers.agents       agents of Stable-Baselines3 and brax on our tasks, through the adapters
 
-Each of the first four checks that the peer computes the same as ours, and stores both records like `jaxrl-vis bench`.
+Each of the first four stores both records like `jaxrl-vis bench`. The renderers and the learner in PyTorch are first checked
+for agreement with ours.
 """

@@ -30,7 +30,11 @@ EVALUATION_SEED = 10_000
 
 
 def evaluate(env: str, act: Callable[[dict[str, np.ndarray]], np.ndarray]) -> dict[str, float]:
-    """Evaluate a policy from observations [N, ...] to actions [N, A]: success and distance (task's unit) at the last step."""
+    """Evaluate a policy, a function from dictionaries of observations and goals [N, ...] to actions [N, A].
+
+    Returns:
+        Mean ``success`` and ``goal_distance`` (in the task's unit) at the last step.
+    """
     from jaxrl_vis_envs.adapters.gymnasium import GymnasiumVectorEnv
 
     envs = GymnasiumVectorEnv(env, EVALUATION_EPISODES)
@@ -43,7 +47,7 @@ def evaluate(env: str, act: Callable[[dict[str, np.ndarray]], np.ndarray]) -> di
 
 
 def train_sb3(env: str, steps: int, seed: int) -> Measurement:
-    """Train DDPG with hindsight goals and the sparse reward, on one environment."""
+    """Train DDPG with hindsight goals and the sparse reward, on one environment; see `training_result`."""
     import gymnasium
     import stable_baselines3
     import torch
@@ -80,7 +84,7 @@ def train_sb3(env: str, steps: int, seed: int) -> Measurement:
 
 
 def train_brax(env: str, steps: int, seed: int) -> Measurement:
-    """Train PPO on the concatenated observation and goal, with minus the distance as the reward."""
+    """Train PPO on the concatenated observation and goal, with minus the distance as reward; see `training_result`."""
     import functools
 
     import brax

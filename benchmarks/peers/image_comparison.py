@@ -34,8 +34,8 @@ class Comparison:
         config: Entries of the record.
         mj_model: Model, rendered by its first cameras.
         cameras: Number of these cameras, of which each renders an image of every pose.
-        scene: Our scene of the model, seen by the first.
-        batches: Poses, see `models.random_poses`; the first ``config["images"]`` over the cameras of each are rendered.
+        scene: Our scene of the model, seen by the first camera.
+        batches: Poses, see `models.random_poses`; the first ``config["images"] / cameras`` of each batch are rendered.
         repeats: Maximum number of timed repeats.
         rate: Our images per second.
         colours: Our images of the first poses of the first batch, [K, H, W, 3] uint8.

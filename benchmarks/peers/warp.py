@@ -147,7 +147,7 @@ def render_options(scene: Scene, mj_model: mujoco.MjModel, batches: list[dict[st
 
 
 def may_show_backs(scene: Scene, mj_model: mujoco.MjModel, batches: list[dict[str, np.ndarray]]) -> bool:
-    """Return True if a camera may see a surface from inside: it is within a geom's bounding sphere, or there are triangles.
+    """Return True if the first camera may see a surface from inside: in a geom's bounding sphere, or if there are triangles.
 
     Planes do not count: our renderer renders both sides of them, as does Warp without culling.
     """

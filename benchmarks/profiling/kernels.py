@@ -56,7 +56,15 @@ def count_kernels(events: list[tuple[float, float, str]]) -> tuple[collections.C
 
 
 def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: bool) -> None:
-    """Print the time of a call and of its kernels, per one of its ``turns``; ``in_order``: also the kernels of one turn."""
+    """Print the time of a call and of its kernels, and the slowest kernels, all divided by the number of ``turns`` in the call.
+
+    Args:
+        name: Label of the first line.
+        call: Function to time, which must wait for its results.
+        turns: Number of repetitions in a call, such as gradient steps.
+        rows: Number of kernels to list.
+        in_order: List the kernels of one turn as well, in their order.
+    """
     call()
     seconds = []
     for _ in range(3):

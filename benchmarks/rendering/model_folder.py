@@ -259,7 +259,7 @@ class Comparison:
         return frames
 
     def reference_fault(self, view: View, scene: Scene, ours: list[Frame], theirs: list[Frame]) -> str:
-        """Return why MuJoCo's images are not a valid reference; an empty string if they are."""
+        """Return the reason that makes MuJoCo's images an invalid reference, as text; an empty string if they are valid."""
         nowhere = np.zeros(theirs[0].segmentation.shape, bool)
         for direction in ([0.3, 0.5, 0.8], [-0.7, 0.2, 0.1]):
             moved = self.reference(view, SHIFT * self.mj_model.stat.extent * np.array(direction))

@@ -6,7 +6,7 @@
 **Faults.** Each run is `jaxrl-vis train Reacher` with small settings, in a process of its own, interrupted by faults and
 resumed until it is finished. After every fault it is checked that
 
-* nothing from before the last intact checkpoint is lost: no row of metrics.jsonl, and no newer checkpoint;
+* no row of metrics.jsonl up to the last intact checkpoint is lost, and the newest checkpoint is at most one iteration older;
 * there is no traceback, and the exit status is the one expected of the fault;
 
 and at the end of a run that it has every row exactly once and, unless a replay was lost, which is counted, that its

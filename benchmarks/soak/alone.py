@@ -153,7 +153,7 @@ def _check_single_line(process: RunProcess, text: str) -> None:
 
 
 def worker_of_a_study(folder: Path, rng: random.Random, references: "References", executor: Sequence[str] = ()) -> None:
-    """Kill one of two cells: the other continues, and the next start finishes both, with the rows of undisturbed ones."""
+    """Kill the run of one of two cells: the other continues, and the next start finishes both, with undisturbed rows."""
     words = _sweep_arguments(folder, executor)
     process = _start_command(words, folder)
     with kill_on_exit(process):
@@ -226,7 +226,7 @@ def worker_of_grasping(folder: Path, rng: random.Random, references: "References
 
 
 class NotStruck(Exception):
-    """The command finished before the fault."""
+    """Signal that the command finished before the fault."""
 
 
 def _check_pool(arguments: Sequence[str], folder: Path, rng: random.Random) -> None:

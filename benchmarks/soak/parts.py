@@ -135,7 +135,7 @@ class RunProcess:
             self.lines.append(line.rstrip())
 
     def wait(self, seconds: float = 240.0) -> int:
-        """Wait for the process and its last line; return its exit status.
+        """Wait for the process and its last line, and store its output in `LAST`; return its exit status.
 
         Raises:
             Broken: The process does not end in time; it is killed.
@@ -164,7 +164,7 @@ class RunProcess:
         return self.popen.poll() is None
 
     def wait_for(self, condition: Callable[[], bool], seconds: float = 180.0) -> bool:
-        """Wait for a condition, at most until the process ends; return True if it holds."""
+        """Wait for a condition, at most ``seconds`` and until the process ends; return True if it holds."""
         deadline = time.monotonic() + seconds
         while self.is_running() and time.monotonic() < deadline:
             if condition():

@@ -30,7 +30,7 @@ class Record:
     """Results of one soak, or of several.
 
     Attributes:
-        machine: Commit, versions, cores.
+        machine: Commit, versions, number of cores, and True for ``root`` if root ran the soak.
         seed: Seed of the order and times of the faults.
         minutes: Duration, minutes.
         faults: Number of faults of each kind.

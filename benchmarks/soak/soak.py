@@ -27,7 +27,7 @@ class Soak:
         faults: Maximum number of faults.
         seed: Seed of the order and times of the faults.
         seconds: Time after which no further fault begins, s.
-        note: Called with the record after each fault.
+        note: Function called with the record after each fault, violation and run.
         alone: Include faults with folders of their own (`benchmarks.soak.alone`), which take longer.
     """
 

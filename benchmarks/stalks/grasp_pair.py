@@ -29,7 +29,7 @@ def perceive_scene(scene: Scene, painter: Painter) -> Perception:
 
 
 def make(path: Path) -> tuple[Once, int]:
-    """Return the job of a process on the runs in a file, and their number; see `print_rate`."""
+    """Return a function that processes the scene with an index in a file, and the number of scenes; see `print_rate`."""
     scenes = pickle.loads(path.read_bytes())
     params, settings, _ = read_weights(SHIPPED)
     painter = Painter(params, settings)

@@ -24,8 +24,8 @@ def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]
         frame: Index of the pair in its sequence.
 
     Returns:
-        For each stalk that is at least 0.3 visible, its visibility, and confidence and error (mm) by method; stalks that a
-        method cannot measure are left out.
+        For each stalk that is at least 0.3 visible, its visible fraction ``seen``, the error of the ``strip`` and ``ellipse``
+        methods (mm), and the ``confidence`` of the latter; stalks that a method cannot measure are left out.
     """
     sequence = Sequence.of(draw(family, seed))
     pair, drive = sequence[frame], sequence.drive

@@ -29,7 +29,7 @@ from jaxrl_vis_envs.plants.truth import stalks_in_view
 
 
 def make(path: Path, stated: Calibration) -> tuple[Once, int]:
-    """Return the job of a process on the pairs in a file, and their number; see `print_rate`."""
+    """Return a function that processes the pair with an index in a file, and the number of pairs; see `print_rate`."""
     images = list(np.load(path).values())
     pairs = list(zip(images[::2], images[1::2]))
     params, settings, _ = read_weights(SHIPPED)

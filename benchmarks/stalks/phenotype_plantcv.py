@@ -105,7 +105,7 @@ def plantcv_width(pcv: Any, mask: np.ndarray) -> float:
 
 
 def compare(file: Path) -> None:
-    """Print the width errors of PlantCV and of this project on the stored masks, mm; exit with a line without PlantCV.
+    """Print the width errors of PlantCV and of this project on the stored masks, mm; exit with one line if PlantCV is missing.
 
     Args:
         file: The .npz file with masks, true widths and this project's widths.

@@ -43,7 +43,7 @@ def print_rate(make: Callable[[], tuple[Once, int]], workers: int, seconds: floa
     """Print the time per pair with several parallel processes, each working on its own pairs.
 
     Args:
-        make: Called in each process; returns the job and the number of inputs, all of which are processed once before timing.
+        make: Function called in each process; returns the job and the number of inputs, all processed once before timing.
         workers: Number of processes.
         seconds: Duration of the timing, once all are ready, s.
         count: Number of pairs per call of the job.

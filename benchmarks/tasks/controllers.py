@@ -23,7 +23,8 @@ from jaxrl_vis_envs.tasks import stalk_arm
 
 MIN_SUCCESS = 0.95
 Policy = Callable[[Any, Any, Any], tuple[jax.Array, Any]]
-"""Function (state, configuration of the goal, memory) -> (action [A], memory)."""
+"""Function (state, configuration of the goal, memory) -> (action [A], memory). It is returned with its initial memory, None if
+unused."""
 
 
 def fetch_reach(env: Any) -> tuple[Policy, Any]:

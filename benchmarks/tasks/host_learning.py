@@ -51,7 +51,7 @@ class Cell:
     """One run.
 
     Attributes:
-        mode: ``learn_online`` or ``learn_offline``.
+        mode: ``live`` (`learn_online`) or ``recorded`` (`learn_offline`).
         method: ``exact``, ``tolerance``, ``oracle``, ``contrastive`` or ``cloning``.
         noise: Standard deviation of the camera noise, grey levels.
         seed: Seed of the learner and, live, of the robot.
@@ -68,7 +68,7 @@ class Cell:
         return f"{self.mode}_{self.method}_noise{self.noise}_seed{self.seed}"
 
     def options(self) -> dict[str, Any]:
-        """Return the keyword arguments of `indicator.Learner`."""
+        """Return the keyword arguments of `indicator.Learner`, without ``capacity``."""
         of_method: dict[str, dict[str, Any]] = {
             "exact": {"method": "indicator_balance_filter", "relabel_probability": 0.8},
             # Noise of sigma differs by sigma sqrt(2) between two images; without noise, a few grey levels.
@@ -104,7 +104,7 @@ class Size:
 
 
 def cells() -> list[Cell]:
-    """Return all cells, in the order of their interest."""
+    """Return all cells, the most important first."""
     first, *others = _SEEDS
     one = [Cell("live", "exact", 0, first), *(Cell("recorded", method, 0, first) for method in ("exact", "cloning"))]
     noisy = [Cell("recorded", method, noise, first) for noise in _NOISES for method in ("exact", "tolerance", "oracle")]

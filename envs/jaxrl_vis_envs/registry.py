@@ -37,7 +37,7 @@ _ENTRIES: dict[str, _Entry] = {}
 
 
 class UnknownEnvironmentError(ValueError):
-    """Error for a name that is not, or not uniquely, that of a complete environment."""
+    """Error for a name that matches no environment, several, or one that is incomplete."""
 
 
 class UnknownOverrideError(ValueError):
@@ -233,7 +233,7 @@ def _module_entry(name: str, module: ModuleType, task: str) -> _Entry:
     """Return the environment ``task`` of a module: registered by the module under that name, or else its class.
 
     Raises:
-        UnknownEnvironmentError: There is none; the message lists those that exist.
+        UnknownEnvironmentError: There is none, or it is not a complete environment.
     """
     registered = {
         registered_name: entry
@@ -260,7 +260,11 @@ def _module_entry(name: str, module: ModuleType, task: str) -> _Entry:
 
 
 def _class_entry(name: str, task: type[GoalEnv]) -> _Entry:
-    """Build an entry from a task's class, which is constructed as ``task(config)`` with an annotated ``config``."""
+    """Build an entry from a task's class, which is constructed as ``task(config)`` with an annotated ``config``.
+
+    Raises:
+        UnknownEnvironmentError: ``config`` is not annotated with a dataclass, or a field of that has no default.
+    """
     build: Any = task
     parameters = list(inspect.signature(task).parameters.values())
     if not parameters:

@@ -81,7 +81,7 @@ def speed_table(results: Path) -> str:
     return "\n".join(lines)
 
 
-# Fields without an effect on learning: files on the disk, and the method of computing the same gradients.
+# Fields without an effect on learning; that of the logarithm has none if no loss takes one.
 _NEUTRAL = ("checkpoint_interval", "full_checkpoint_interval")
 _LOGARITHMIC = ("actor_log",)
 

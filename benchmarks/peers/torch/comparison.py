@@ -74,7 +74,7 @@ def load() -> Any:
 
 
 def by_name(tree: Any) -> dict[str, Any]:
-    """Flatten nested dictionaries into leaves by path, such as encoder/kernel_0."""
+    """Flatten nested dictionaries; return the leaves by path, such as encoder/kernel_0."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {"/".join(str(entry.key) for entry in path): leaf for path, leaf in leaves}
 
@@ -216,7 +216,7 @@ class _Peer:
         self._episodes = [np.asarray(leaf) for leaf in leaves]
 
     def replay(self, encoder: str) -> Any:
-        """Convert our replay to a `learner.Replay`."""
+        """Convert our replay to a `learner.Replay` for one of `encoders`."""
         return self._module.Replay(*self._episodes, self._rules(encoder, "float32"), self.device)
 
     def _rules(self, encoder: str, dtype: str) -> Any:
@@ -252,7 +252,17 @@ class _Peer:
         return compare(self.reference, np.asarray(losses), slopes)
 
     def time(self, replay: Any, encoder: str, dtype: str, steps: int, repeats: int) -> tuple[Any, float]:
-        """Time one call of ``steps`` gradient steps; return the `Timing` and the duration of compilation, s.
+        """Time one call of ``steps`` gradient steps.
+
+        Args:
+            replay: Replay from `replay`, for the same encoder.
+            encoder: One of `encoders`.
+            dtype: Name of the networks' compute dtype.
+            steps: Gradient steps per call.
+            repeats: Number of timed calls.
+
+        Returns:
+            `Timing` of a call, and the duration of compilation, s.
 
         Raises:
             AssertionError: The first critic loss differs from ours by more than rounding, or a network does not change.

@@ -15,7 +15,7 @@ ENCODERS: tuple[Encoder, ...] = ("blocks", "convolutions")
 
 
 def to_layout(images: Any, encoder: Encoder, levels: int) -> Any:
-    """Convert planar images [..., C, H, W] to a layout: [..., blocks, 4^levels * C] or [..., H, W, C]."""
+    """Convert planar images [..., C, H, W] to [..., blocks, 4^levels * C], without incomplete blocks, or [..., H, W, C]."""
     if encoder == "convolutions":
         return images.movedim(-3, -1).contiguous()
     *batch, channels, height, width = images.shape

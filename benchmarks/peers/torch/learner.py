@@ -1,7 +1,8 @@
 """PyTorch implementation of `jaxrl_vis.learner`'s learner, optimised for speed; `comparison` measures it.
 
-    step        gather -> normalise -> losses -> gradients -> Adam -> target networks: one function, compiled as a whole
-    run         sample the batches of all steps, then replay one CUDA graph per step
+    Learner.step    gather -> normalise -> losses -> gradients -> Adam -> target networks, compiled as one function; target
+                    networks that are updated less often than every step are updated by a second one, `Learner.follow`
+    Compiled()      sample the batches of all steps, then run them one by one: on a GPU, replay one CUDA graph per step
 
 Parameters are float32 tensors by name ("encoder/kernel_0", "head/output/bias"); large kernels have a copy in the compute
 dtype of the networks, which Adam updates with them. Everything is updated in place, because a CUDA graph has fixed addresses.
@@ -35,8 +36,8 @@ class Rules:
     Attributes:
         encoder: Layout of images and kernels, see `layout`.
         dtype: Compute dtype of the networks.
-        levels: Layers of the encoder.
-        hidden: Hidden layers of a head.
+        levels: Number of convolutions (kernel 2x2, stride 2) of the encoder.
+        hidden: Number of hidden layers of a head.
         shared_encoder: The actor reads the critic's latents, without a gradient into them.
         target_encoder: Target networks have their own encoders; otherwise their heads read the latents of the online networks.
         actor_interval: Gradient steps of the critic per step of the actor.
@@ -233,6 +234,10 @@ class Learner:
         Args:
             choice: Batch [3, B] int64, see `draw`.
             with_actor: Differentiate the actor's loss as well; otherwise it is 0 and without gradients.
+
+        Returns:
+            Losses of critic and actor, scalars float32, and gradients of critic and actor, with the shapes and dtypes of the
+            parameters, {} for an actor without gradients.
         """
         rules = self.rules
         actor, critic, target_actor, target_critic = map(self._parameters, NETWORKS)
@@ -327,7 +332,7 @@ class Learner:
 
 
 class Compiled:
-    """Compiled `Learner.step`: on a GPU autotuned, with one CUDA graph per step.
+    """Compiled `Learner.step`; on a GPU autotuned and captured as CUDA graphs. Compiling takes some gradient steps.
 
     Args:
         learner: Learner to compile.

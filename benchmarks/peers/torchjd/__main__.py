@@ -53,7 +53,10 @@ def equality(python: Path, jacobians: int, results: Path) -> int:
 
 
 def keep(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], results: Path) -> int:
-    """Compare the results of both sides, print and write the record; return 1 if a method exceeds its tolerance, else 0."""
+    """Compare the results of both libraries, print and write the record; return 1 if a method exceeds its tolerance, else 0.
+
+    Removes ``versions`` from ``theirs``.
+    """
     from benchmarks.peers.torchjd import equality
 
     versions = dict(str(line).split(" ") for line in theirs.pop("versions"))

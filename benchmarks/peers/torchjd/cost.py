@@ -29,7 +29,7 @@ TARGETS = 16
 PASSES = 10
 """Calls of the function per timing."""
 BUDGET = 1.0
-"""Time limit for the timings of a function, s; TorchJD's solvers on the host take up to a second a call."""
+"""Time after which a function with three timings gets no more, s; TorchJD's solvers on the host take up to a second a call."""
 METHODS = tuple(name for name in jw.WEIGHTINGS if name not in ("none", "none_log", "fixed", "ol_aux_ablation"))
 
 
@@ -88,7 +88,7 @@ def losses_of(params: Any, features: jax.Array, batch: dict[str, jax.Array]) -> 
 
 
 def time_call(function: Callable[..., Any], arguments: tuple[Any, ...], repeats: int) -> float:
-    """Return the median time of a call, s, without compilation, of up to ``repeats`` timings within about `BUDGET`."""
+    """Return the median time of a call, s, without compilation: of three timings, or up to ``repeats`` within `BUDGET`."""
     call = jax.jit(function)
     jax.block_until_ready(call(*arguments))
     seconds, end = [], time.perf_counter() + BUDGET
@@ -130,7 +130,7 @@ def time_method(name: str, size: Size, count: int) -> list[dict[str, Any]]:
 def measure_all(size: Size, python: Path | None, results: Path) -> int:
     """Time all methods on both sides, print a table and update the record after each number of losses; return the exit status.
 
-    The record keeps numbers of losses that are not measured again, if device, versions and sizes are the same.
+    The record keeps the rows of other numbers of losses if device, versions and sizes are the same.
     """
     path = results_path("weighting_cost", results)
     for count in size.losses:
@@ -148,7 +148,7 @@ def measure_all(size: Size, python: Path | None, results: Path) -> int:
 
 
 def time_peer(size: Size, count: int, python: Path | None) -> dict[str, Any]:
-    """Return TorchJD's rows for K losses and its versions; none without its interpreter."""
+    """Return TorchJD's ``rows`` for K losses and its ``versions``; both empty without its interpreter."""
     from benchmarks.peers.torchjd.__main__ import run_peer
 
     if python is None:

@@ -1,4 +1,4 @@
-"""Differences between the results of both sides, and how well each solves the problem that a method's paper states.
+"""Differences between the results of both libraries, and how well each solves the problem that a method's paper states.
 
 Jacobians are [K, P] float64 for K losses and P parameters, weights [K] float64.
 """
@@ -36,10 +36,11 @@ def gap(jacobian: np.ndarray, weights: np.ndarray) -> float:
 
 
 def cagrad_loss(jacobian: np.ndarray, weights: np.ndarray) -> float:
-    """Return by how much the worst slope falls short of the dual bound, relative to the mean gradient's squared norm.
+    """Return the shortfall of the worst slope from the dual bound, relative to the mean gradient's squared norm.
 
     The dual is evaluated at the weights within the convex hull. An excess of the step over CAGrad's radius, relative to the
-    radius, is added. The result is 0 for weights of 0, which stand for a stationary point.
+    radius, is added. The result is 0 for weights of 0, which stand for a stationary point, and for weights that sum to 1, which
+    do not determine the dual's.
     """
     mean = jacobian.mean(axis=0)
     radius, step = CAGRAD_RADIUS * np.linalg.norm(mean), weights @ jacobian

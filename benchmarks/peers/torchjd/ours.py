@@ -22,7 +22,7 @@ SOLVED: dict[str, jw.Weighting] = {
     "dualproj": jw.dualproj(),
     "nash_mtl": jw.nash_mtl(),
 }
-"""Methods with a solver; the weights [K] are also compared."""
+"""Methods with a solver; directions are compared, and the residuals of the weights [K]."""
 READERS: dict[str, jw.Weighting] = {
     "geometric_mean": jw.geometric_mean(eps=1e-14),
     "stch": jw.stch(STCH_MU),

@@ -110,7 +110,10 @@ def paths(losses: torch.Tensor) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def compute(prefix: str, path: str) -> dict[str, np.ndarray]:
-    """Compute all results for K losses, where ``prefix`` is K as text, from the file ``path``, by ``K/NAME``."""
+    """Compute all results for K losses, where ``prefix`` is K as text, from the file ``path``, by ``K/NAME``.
+
+    Nash-MTL's weights are NaN for Jacobians without full rank.
+    """
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
     arrays = dict(np.load(path))

@@ -75,7 +75,7 @@ def problem(
 def make_step(
     trunk: list[torch.Tensor], heads: list[torch.Tensor], inputs: torch.Tensor, targets: list[torch.Tensor]
 ) -> Callable[[Any], None]:
-    """Return the function of an aggregator that computes the gradient of all parameters."""
+    """Return a function that sets the gradients (``grad``) of all parameters by an aggregator."""
 
     def step(aggregator: Any) -> None:
         hidden = inputs

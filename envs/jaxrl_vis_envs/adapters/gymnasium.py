@@ -84,6 +84,9 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
         """Start an episode. A ``seed`` determines this and all following episodes; ``options`` is ignored.
 
+        Returns:
+            Observation, and an info as from `step`.
+
         Raises:
             gymnasium.error.Error: ``seed`` is negative or not a Python integer.
         """
@@ -206,6 +209,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
         """Start all episodes. Environment i is seeded with ``seed + i`` or ``seed[i]``; ``options`` is ignored.
+
+        Returns:
+            Observations, and infos as from `step`.
 
         Raises:
             ValueError: ``seed`` is neither an integer nor one per environment.

@@ -23,9 +23,10 @@ class Format:
     Attributes:
         layout: ``dict``: the environment's own observation and the images. ``images``: only the images. ``image``: one array
             [H, W, C], the channels of all images in order, then those of all goal images.
-        dtype: ``float32``: colours from 0 to 1. ``uint8``: colours from 0 to 255. Depths follow if there is a
-            ``depth_range``.
-        depth_range: Depths (m) encoded as the ends of the dtype's range, linear in between. If None, depths are in m, float32.
+        dtype: ``float32``: colours from 0 to 1. ``uint8``: colours from 0 to 255. Depths have the same dtype and range if there
+            is a ``depth_range``; other outputs keep their dtypes.
+        depth_range: Depths (m) encoded as the ends of that range, linear in between and clipped. If None, depths are float32,
+            in m.
 
     Raises:
         ValueError: There is no such layout or dtype, or ``depth_range`` is not (near, far) with 0 <= near < far.

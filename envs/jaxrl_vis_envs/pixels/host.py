@@ -59,7 +59,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         self.observation_space = self._build_space()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode, and render the goal image, if there is one."""
+        """Start an episode, and render its goal images, if any; return the observation and the wrapped environment's info."""
         own, info = self.env.reset(seed=seed, options=options)
         if self._goal_image is not None:
             goal = poses.joint_positions(poses.physics_data(formats.goal_poses(self._goal_image, self.unwrapped)))
@@ -67,7 +67,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         return self._observe(own), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the wrapped environment, and render."""
+        """Step the wrapped environment and render; return its results, with the observation replaced."""
         own, reward, terminated, truncated, info = self.env.step(action)
         return self._observe(own), reward, terminated, truncated, info
 

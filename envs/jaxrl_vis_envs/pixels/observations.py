@@ -39,9 +39,10 @@ class PixelsConfig(checks.CheckedConfig):
     image_size: int = 64
     """Height and width, in pixels."""
     pixels: Literal["rgbd", "rgb", "depth"] = "rgbd"
-    """Channels."""
+    """Channels of an image: colours, depth, or both (``rgbd``)."""
     depth_range: tuple[float, float] = (0.1, 10.0)
-    """Depths encoded as 0 and 255, m. Task defaults are as tight as their moving parts allow."""
+    """Depths encoded as 0 and 255, m. Task defaults are as tight as their moving parts allow. Only for
+    ``depth_encoding="metric"``."""
     frame_stack: int = 1
     """Number of most recent images stacked in an observation. With one, velocities are not observable."""
     depth_encoding: DepthEncoding = "metric"

@@ -59,7 +59,7 @@ def wrap(
             ``pixels/CAMERA/OUTPUT`` and, for goals, ``.../goal``. ``images``: only the images. ``image``: one array [H, W, C].
         dtype: ``float32`` (colours from 0 to 1, as brax's agents expect them) or ``uint8``. If None, uint8 for Gymnasium, else
             float32.
-        depth_range: Depths (m) encoded as the ends of the dtype's range. If None, depths are in m, float32.
+        depth_range: Depths (m) encoded as 0 and 1, or as 0 and 255 for uint8. If None, depths are in m, float32.
         clip_range: Near and far clipping planes of the cameras (m), or a dictionary of these by camera; the model's if None.
         step: For a `mujoco.MjModel`, function ``step(data, action)`` from `mjx.Data` to `mjx.Data`. If None, one `mjx.step`
             with the action as ``ctrl``.

@@ -17,7 +17,7 @@ from jaxrl_vis_envs.render.viewpoint import camera_pose as camera_pose
 from jaxrl_vis_envs.render.viewpoint import lens as lens
 
 INFINITE = 1e9
-"""Bound of what has no end, see `sphere_sides`."""
+"""Value that stands for an infinite bound, see `sphere_sides`."""
 
 
 class Rays(NamedTuple):

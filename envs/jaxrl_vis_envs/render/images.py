@@ -31,7 +31,15 @@ _INTEGERS = {"texels": jnp.uint32, "texture": jnp.int32, "cluster_places": jnp.i
 
 
 class _View(NamedTuple):
-    """Quantities computed once per environment."""
+    """Quantities computed once per environment.
+
+    Attributes:
+        rotation: [3, 3] float32, see `camera.camera_pose`.
+        unit: Rendered objects.
+        table: `lookup.object_table`.
+        lights: Lights, from `lights.pack`.
+        blocked: `search.blocked`, or a function of this form.
+    """
 
     rotation: jax.Array
     unit: shapes.UnitShapes

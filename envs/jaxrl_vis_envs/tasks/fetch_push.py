@@ -89,7 +89,8 @@ class VisualFetchPushConfig(PixelsConfig, FetchPushConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.4, 1.8)
-    """Depths encoded as 0 and 255, m: 5.5 mm per step, from in front of the nearest gripper to behind the robot."""
+    """Depths encoded as 0 and 255, m: 5.5 mm per step, from in front of the nearest gripper to behind the robot. Only for
+    ``depth_encoding="metric"``."""
     goal_mask: Literal["none", "object"] = "none"
     """Part of the images that indicator rewards compare: all (none), or the box's pixels by segmentation (object), which the
     lowest bit of the first channel then marks."""

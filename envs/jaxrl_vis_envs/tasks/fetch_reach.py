@@ -73,9 +73,10 @@ class VisualFetchReachConfig(PixelsConfig, FetchReachConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.4, 1.8)
-    """Depths encoded as 0 and 255, m: 5.5 mm per step, from in front of the nearest gripper to behind the robot."""
+    """Depths encoded as 0 and 255, m: 5.5 mm per step, from in front of the nearest gripper to behind the robot. Only for
+    ``depth_encoding="metric"``."""
     clip_range: tuple[float, float] = (0.026, 130.0)
-    """Near and far clipping planes of the release, m."""
+    """Near and far clipping planes of the release, m. Only for ``depth_encoding="zbuffer"``."""
     cross_hair: bool = False
     """Render the release's cross-hair at the mocap body that pulls the gripper; in an episode's first image, at the goal."""
     view: View = "front"

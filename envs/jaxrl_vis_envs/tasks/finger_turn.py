@@ -54,7 +54,8 @@ class VisualFingerTurnConfig(PixelsConfig, FingerTurnConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.8, 1.3)
-    """Depths encoded as 0 and 255, m: 2 mm per step; finger and spinner are between .85 and 1.25 m."""
+    """Depths encoded as 0 and 255, m: 2 mm per step; finger and spinner are between .85 and 1.25 m. Only for
+    ``depth_encoding="metric"``."""
     frame_stack: int = 3
     """Number of most recent images stacked in an observation: three in the thesis, one in the authors' release."""
 

@@ -60,11 +60,11 @@ class HandReachConfig(TaskConfig):
     goal_actions: int = 20
     """Number of random actions that generate a goal, with ``goal_rule="random_actions"``."""
     goal_noise: float = 5.0
-    """Standard deviation of the Gaussian noise added to each of these uniform actions before clipping to [-1, 1]."""
+    """Standard deviation of the Gaussian noise added to each of the uniform ``goal_actions`` before clipping to [-1, 1]."""
     substeps: int = 20
     """Physics steps per control step of 40 ms (20 gives the original's 2 ms; 10 adds .1 mm of error at the tips)."""
     goal_substeps: int = 10
-    """Physics steps per control step while generating a goal, for which only the distribution matters."""
+    """Physics steps per control step while generating a goal by random actions, of which only the distribution matters."""
     contacts: bool = True
     """Simulate collisions of fingers, thumb and palm. False is for measuring the effect of contacts."""
     solver_iterations: int = 1
@@ -85,9 +85,10 @@ class VisualHandReachConfig(PixelsConfig, HandReachConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.7, 0.96)
-    """Depths encoded as 0 and 255, m: 1 mm per step, from above upright fingers to below the lowest knuckle."""
+    """Depths encoded as 0 and 255, m: 1 mm per step, from above upright fingers to below the lowest knuckle. Only for
+    ``depth_encoding="metric"``."""
     clip_range: tuple[float, float] = (0.0124, 62.0)
-    """Near and far clipping planes of the release, m."""
+    """Near and far clipping planes of the release, m. Only for ``depth_encoding="zbuffer"``."""
     view: View = "palm"
     """Camera pose: above the palm or, as in the release, in front of the fingertips."""
     tip_marks: TipMarks = "bright"

@@ -58,7 +58,8 @@ class VisualReacherConfig(PixelsConfig, ReacherConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.8, 1.1)
-    """Depths encoded as 0 and 255, m: 1.2 mm per step; the arm is between .82 and 1.04 m."""
+    """Depths encoded as 0 and 255, m: 1.2 mm per step; the arm is between .82 and 1.04 m. Only for
+    ``depth_encoding="metric"``."""
 
 
 class Reacher(MjxGoalEnv):

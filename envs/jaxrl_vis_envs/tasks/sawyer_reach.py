@@ -60,7 +60,8 @@ class VisualSawyerReachConfig(PixelsConfig, SawyerReachConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (1.4, 2.6)
-    """Depths encoded as 0 and 255, m: 4.7 mm per step, from in front of the highest hand to the table behind the lowest."""
+    """Depths encoded as 0 and 255, m: 4.7 mm per step, from in front of the highest hand to the table behind the lowest. Only
+    for ``depth_encoding="metric"``."""
 
 
 class SawyerReach(PulledArm):

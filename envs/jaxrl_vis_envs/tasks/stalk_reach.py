@@ -86,7 +86,8 @@ class VisualStalkReachConfig(PixelsConfig, StalkReachConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.4, 1.4)
-    """Depths encoded as 0 and 255, m: 4 mm per step, from in front of the raised arm to behind the row."""
+    """Depths encoded as 0 and 255, m: 4 mm per step, from in front of the raised arm to behind the row. Only for
+    ``depth_encoding="metric"``."""
 
 
 class _Episode(NamedTuple):

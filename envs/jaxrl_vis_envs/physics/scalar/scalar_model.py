@@ -55,8 +55,8 @@ class LimitConstraint(NamedTuple):
 
     Attributes:
         joints: Coefficient of each joint in the limited quantity.
-        bounds: Lower and upper bound of the limited quantity.
-        margin: Distance from a bound below which the limit acts.
+        bounds: Lower and upper bound of the limited quantity, rad or m.
+        margin: Distance from a bound below which the limit acts, rad or m.
         inverse_weight: Approximate inverse inertia along the constraint.
         softness: Softness of the constraint.
     """

@@ -117,7 +117,7 @@ def _canopy(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
 
 
 def _trunks(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
-    """Paste trunks or poles of any width and brightness, upright up to a small lean."""
+    """Paste 3 to 39 trunks or poles, 1.5 to 20 pixels wide, of random brightness and with a small random lean."""
     picture = picture.copy()
     columns = np.arange(SHAPE[1])
     for _ in range(rng.integers(3, 40)):

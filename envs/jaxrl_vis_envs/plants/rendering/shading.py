@@ -70,7 +70,13 @@ class Tables(NamedTuple):
 
 
 class Hit(NamedTuple):
-    """Ray hits: depth, row in the table, and kind (0 nothing, 1 ground, 2 cones, 3 triangles)."""
+    """First hit of each ray, arrays of one shape.
+
+    Attributes:
+        depth: Planar depth in m, float32; `FAR` for none.
+        row: Row of `Tables.cones` or `Tables.triangles`, depending on ``kind``, int32; 0 otherwise.
+        kind: 0 nothing, 1 ground, 2 cone, 3 triangle; int32.
+    """
 
     depth: jax.Array
     row: jax.Array

@@ -26,8 +26,8 @@ class MeshPixels(NamedTuple):
     """Nearest triangles, as if there were no primitives, [blocks, P] int32 each.
 
     Attributes:
-        bits: Bits of the depth; of the far plane's where there is no triangle.
-        owner: Row of the object, -1 for none.
+        bits: Bit pattern of the float32 depth, its lowest bits replaced; that of the far plane where there is no triangle.
+        owner: Row of the object in the table of objects, -1 where there is no triangle.
         colour: Packed colour where there is a triangle; None without colours.
     """
 
@@ -75,7 +75,7 @@ def _colour(
     triangle: jax.Array,
     owner: jax.Array,
 ) -> jax.Array:
-    """Return the packed colours of the pixels with a triangle, [blocks, P] int32, any value elsewhere."""
+    """Return the packed colours of the pixels with a triangle, [blocks, P] int32; 0 elsewhere."""
     shape = owner.shape
     rays, near, triangle, owner = jax.tree.map(jnp.ravel, (rays, near, triangle, owner))
     table = lookup.object_table(scene, unit)
@@ -101,7 +101,10 @@ def _colour(
 def put_in_front(
     scene: Scene, pixels: MeshPixels, key: jax.Array, row: jax.Array | None, labelled: bool
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Return the keys and rows of primitives (see `tiles.nearest_key`) with those of nearer triangles put in, [P] each."""
+    """Replace the keys and rows of primitives (see `tiles.nearest_key`) by those of nearer triangles, [P] int32 each.
+
+    Without ``row``, the keys of a ``labelled`` pass hold the rows in their lowest bits, see `raycast.code_mask`.
+    """
     is_triangle = pixels.owner >= 0
     if row is not None:
         is_nearer = is_triangle & (pixels.bits <= key)

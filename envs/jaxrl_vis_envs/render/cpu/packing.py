@@ -17,7 +17,7 @@ def pack(colour: Vector, bits: int) -> jax.Array:
 
 
 def unpack_channels(packed: jax.Array, bits: int) -> Vector:
-    """Invert `pack`."""
+    """Unpack the result of `pack`: three channels [P] float32 in [0, 1]."""
     steps = 2**bits - 1
     return tuple(((packed >> shift * bits) & steps).astype(jnp.float32) / float(steps) for shift in range(3))
 

@@ -283,7 +283,7 @@ class _Colouring:
 
 
 def _select_row(table: jax.Array, rows: list[int], index: jax.Array) -> lookup.Row:
-    """Return the row of every pixel, as `lookup.fetch`. Few rows are selected by comparisons, since XLA would store lookups."""
+    """Select each pixel's object as `lookup.fetch`. Few ``rows`` are selected by comparisons, since XLA would store lookups."""
     if len(rows) > _MAX_SELECTED:
         return lookup.fetch(table, index)
     first, *others = rows or [0]

@@ -21,7 +21,11 @@ _MAX_SHEETS = 8
 
 
 def can_blend(scene: Scene) -> bool:
-    """Return True if the scene's transparent objects are few primitives, without alpha in their textures."""
+    """Return True if `blend` supports the scene.
+
+    Its transparent objects must be few primitives that are transparent from all sides, without alpha in their textures, and
+    the keys must contain the rows (`raycast.has_separate_rows`).
+    """
     rows = sheet_rows(scene)
     fine = (shapes.MESH, shapes.HFIELD)
     simple = [scene.transparent[row] == reading.CLEAR and scene.object_types[row] not in fine for row in rows]
@@ -30,7 +34,7 @@ def can_blend(scene: Scene) -> bool:
 
 
 def sheet_rows(scene: Scene) -> list[int]:
-    """Return the rows of the transparent objects, in the order in which the model declares them."""
+    """Return the indices of the transparent objects, in the order in which the model declares them."""
     rows = [row for row, clear in enumerate(scene.transparent) if clear]
     return sorted(rows, key=lambda row: scene.object_ids[row])
 
@@ -52,7 +56,7 @@ def face(
         unit: Rendered objects.
         table: `lookup.object_table`.
         light_table: Lights, from `lights.pack`.
-        row: Row of the object.
+        row: Index of the object.
         rays: [P].
         own: [P] int32, keys of the object.
         key: [P] int32, keys of the nearest opaque objects.
@@ -67,7 +71,7 @@ def face(
 
 
 def blend(scene: Scene, unit: shapes.UnitShapes, faces: tuple[jax.Array, ...], colour: jax.Array) -> jax.Array:
-    """Blend the faces of all `sheet_rows` over packed colours [P] int32."""
+    """Blend the faces of all `sheet_rows` over packed colours [P] int32; return packed colours."""
     rows = sheet_rows(scene)
     mixed: Any = unpack_channels(colour, BITS)
     order = jnp.argsort(unit.distance[np.array(rows)])  # stable

@@ -55,7 +55,7 @@ def visible_in_tiles(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> jax.A
 
 
 def non_plane_rows(scene: Scene) -> list[int]:
-    """Return the rows of the rendered objects other than planes."""
+    """Return the indices of the rendered opaque primitives other than planes."""
     return [row for row in raycast.primitive_rows(scene, transparent=False) if scene.object_types[row] != shapes.PLANE]
 
 

@@ -28,7 +28,7 @@ class Hierarchies(NamedTuple):
         nodes: [S, 4] int32: low and high corner of a node's box in cells (ten bits an axis, x lowest); its link, which is the
             node after its subtree, and of a leaf -1 - its first row of ``maps``; and 0.
         maps: [W, 12] float32, maps to unit triangles, the columns `meshes.MAP`, `LEAF` rows for each leaf.
-        rows: [W] int32, rows of `Scene.triangles`.
+        rows: [W] int32, rows of `Scene.triangles`; -1 for the padding of a leaf.
         first: [N] int32, first node of an object in the first octant.
         steps: [N] int32, number of its nodes. Those of octant i start at ``first + i * steps``; bit a of i is set for
             directions that are negative along axis a.

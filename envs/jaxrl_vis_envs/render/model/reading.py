@@ -158,7 +158,7 @@ def bounds(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def check_supported(mj_model: mujoco.MjModel, groups: tuple[int, ...], leave_out: tuple[str, ...]) -> None:
-    """Raise a one-line ValueError that lists all visible objects that are not supported, with a hint."""
+    """Raise a one-line ValueError that lists the visible skins, or else the visible flexes, which are not supported."""
     deformables = (
         ("skin", mj_model.skin_group, mujoco.mjtObj.mjOBJ_SKIN),
         ("flex", mj_model.flex_group, mujoco.mjtObj.mjOBJ_FLEX),

@@ -173,7 +173,7 @@ def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> Nearest:
 
 
 def add_triangles(scene: Scene, key: jax.Array, row: jax.Array | None, found: tuple) -> Nearest:
-    """Return what is nearest of primitives and triangles.
+    """Merge the nearest primitives with the nearest triangles in front of them.
 
     Args:
         scene: The scene.

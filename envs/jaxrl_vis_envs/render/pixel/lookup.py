@@ -38,7 +38,16 @@ class TextureRow(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Properties of one object, or of the object at each pixel: scalars, or arrays [P] float32."""
+    """Properties of one object, or of the object at each pixel: scalars, or arrays [P] float32.
+
+    Attributes:
+        axes, origin, extra: As in `shapes.UnitShapes`.
+        kind: Type, a `mujoco.mjtGeom`.
+        colour: Red, green and blue.
+        emission, specular: Coefficients of the material.
+        exponent: Exponent of highlights, 128 times the shininess.
+        texture: Texture mapping; None in a scene without textures.
+    """
 
     axes: Vector  # of three vectors
     origin: Vector
@@ -158,7 +167,7 @@ def make_row(v: list) -> Row:
 
 
 def fetch(table: jax.Array, row: jax.Array) -> Row:
-    """Fetch the row of every pixel from a table [G, columns] by [P] int32 indices (negative: the first row)."""
+    """Fetch each pixel's object from a table [G, columns] by indices [P] int32 (negative: the first object)."""
     return make_row(_look_up(table, row))
 
 
@@ -176,7 +185,7 @@ def fetch_triangle(scene: Scene, triangle: jax.Array | None) -> TriangleRow | No
 
 
 def _look_up(table: jax.Array, row: jax.Array) -> list[jax.Array]:
-    """Return the columns [P] of table rows [P]."""
+    """Look up rows [P] int32 (negative: the first) of a table [N, columns]; return a list of its columns, [P] each."""
     index = jnp.maximum(row, 0)
     if targets_cpu():
         # Whole rows are stored per pixel and reused; single columns would be looked up again for every use.

@@ -37,7 +37,7 @@ _MAX_ROWS_IN_KEY = 63
 
 
 def has_separate_rows(scene: Scene) -> bool:
-    """Return True if there are too many objects for their rows to be part of the keys."""
+    """Return True if there are too many objects for their indices (rows of the object table) to be part of the keys."""
     return len(scene.object_ids) > _MAX_ROWS_IN_KEY
 
 
@@ -47,7 +47,7 @@ def code_mask(scene: Scene) -> int:
 
 
 def primitive_rows(scene: Scene, transparent: bool) -> list[int]:
-    """Return the rows of the rendered primitives that can be transparent or, unless ``transparent``, that can be opaque."""
+    """Return the indices of the rendered primitives that can be transparent or, unless ``transparent``, that can be opaque."""
     fine = (shapes.MESH, shapes.HFIELD)
     wanted = (CLEAR, CLEAR_FROM_BEHIND) if transparent else (SOLID, CLEAR_FROM_BEHIND)
     return [
@@ -58,7 +58,7 @@ def primitive_rows(scene: Scene, transparent: bool) -> list[int]:
 
 
 def is_behind(unit: shapes.UnitShapes, row: int) -> jax.Array:
-    """Return True if the camera is behind the plane of a row, [] bool."""
+    """Return True if the camera is behind the plane with index ``row``, [] bool."""
     return unit.origin[row, 2] < 0.0
 
 
@@ -90,7 +90,7 @@ def decode(scene: Scene, key: jax.Array, row: jax.Array | None) -> tuple[jax.Arr
 
 
 def row_entry(scene: Scene, unit: shapes.UnitShapes, row: int, rays: Rays) -> tuple[jax.Array, jax.Array]:
-    """Compute where each pixel's ray enters the object of a row (t, planar depth in metres), and a hit mask; [P] each."""
+    """Compute where each pixel's ray enters the object ``row`` (t, planar depth in metres), and a hit mask; [P] each."""
     start, direction, inverse_square = camera.ray_parts(scene, rays)
     kind = scene.object_types[row]
     bare_ball = kind == shapes.SPHERE and scene.atlas.mappings[row] == 0
@@ -178,7 +178,7 @@ def nearest_key(scene: Scene, unit: shapes.UnitShapes, rays: Rays, labelled: boo
 
 
 def _rows_by_type(scene: Scene, rows: list[int]) -> dict[int, np.ndarray]:
-    """Return the rows of each type with enough objects for a loop. Planes are excluded: they fill the image."""
+    """Group objects by type; return the groups large enough for a loop. Planes are excluded: they fill the image."""
     kinds = np.array(scene.object_types)[rows]
     counted = {int(kind): np.array(rows)[kinds == kind] for kind in np.unique(kinds) if kind != shapes.PLANE}
     return {kind: type_rows for kind, type_rows in counted.items() if len(type_rows) > _MAX_UNROLLED_PER_TYPE}

@@ -30,8 +30,8 @@ class Sheet(NamedTuple):
     """Intersections with one transparent object.
 
     Attributes:
-        index: Row of the object.
-        row: Its properties.
+        index: Index of the object.
+        row: Its properties, from the object table.
         hit: Intersections, [P].
         visible: [P] bool, True where they are in front of all opaque objects.
     """
@@ -43,14 +43,14 @@ class Sheet(NamedTuple):
 
 
 class Film(NamedTuple):
-    """Effect of an object on the colour c behind it: ``colour + transmission * c``, [P] each, with three colour components."""
+    """Effect of an object on the colour c behind it: ``colour`` (three [P]) + ``transmission`` [P] * c."""
 
     colour: tuple
     transmission: jax.Array
 
 
 def intersect_sheets(scene: Scene, unit: shapes.UnitShapes, rows: jax.Array, rays: Rays, depth: jax.Array) -> list[Sheet]:
-    """Intersect the transparent objects in front of ``depth`` ([P] float32, metres, of opaque objects)."""
+    """Intersect rays with every transparent object in front of ``depth`` ([P] float32, metres, of opaque objects)."""
     depth = _max_visible_depth(depth)
     sheets = []
     for index in (index for index, clear in enumerate(scene.transparent) if clear):
@@ -77,7 +77,7 @@ def _max_visible_depth(depth: jax.Array) -> jax.Array:
 
 
 def nearest(sheets: list[Sheet], depth: jax.Array, index: jax.Array, normal: tuple) -> tuple[jax.Array, jax.Array, tuple]:
-    """Update depth, row and normal of the nearest opaque object ([P] each) with those of nearer transparent ones."""
+    """Update depth, index and normal of the nearest opaque object ([P] each) with those of nearer transparent ones."""
     for sheet in sheets:
         # Of two objects at the same depth, the one drawn later is visible; rows are in the opposite order.
         margin = jnp.where(sheet.index < index, _DEPTH_TOLERANCE, -_DEPTH_TOLERANCE) * depth
@@ -98,7 +98,7 @@ def blend(
     depth: jax.Array,
     colour: tuple,
 ) -> tuple:
-    """Blend the sheets over the ``colour`` (three [P]) of the opaque objects at ``depth`` [P]."""
+    """Blend the sheets over the ``colour`` (three [P]) of the opaque objects at ``depth`` [P] (m); return three [P]."""
     if not sheets:
         return colour
     declared = sorted(sheets, key=lambda sheet: scene.object_ids[sheet.index])
@@ -121,7 +121,7 @@ def blend(
 def face_colour(
     scene: Scene, unit: shapes.UnitShapes, light_table: jax.Array, sheet: Sheet, rays: Rays
 ) -> tuple[tuple, jax.Array]:
-    """Compute colour and alpha of one face, [P] each; alpha is 0 where it is not visible."""
+    """Compute colour (three [P]) and alpha [P] of one face; alpha is 0 where the face is not visible."""
     # Only opaque objects receive shadows.
     unshadowed = [light._replace(shadows=False) for light in lights.unpack(scene, light_table)]
     face: Any = shade.light_surface(scene, unit, unshadowed, sheet.row, sheet.hit, rays)

@@ -60,7 +60,7 @@ class Bounds(NamedTuple):
 
 
 def opaque_bounds(scene: Scene, unit: shapes.UnitShapes) -> Bounds:
-    """Return the bounds of all clusters of opaque objects; those of others are inverted."""
+    """Return the bounds of all clusters; inverted for transparent objects and for clusters that are not visible."""
     middle, facing = _in_camera(scene, unit)
     radius, sine = scene.clusters[:, 3], scene.clusters[:, 7]
     seen = camera.sphere_sides(scene, middle, radius)
