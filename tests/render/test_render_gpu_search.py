@@ -19,6 +19,7 @@ from jaxrl_vis_envs.render import Scene, images
 from jaxrl_vis_envs.render.gpu import search
 from jaxrl_vis_envs.render.model import hierarchies, meshes
 from jaxrl_vis_envs.render.outputs import Outputs, Planes
+from jaxrl_vis_envs.render.pixel.lights import Light
 from jaxrl_vis_envs.render.pixel.prepare import prepare
 
 KERNEL = functools.partial(search.by_kernel, interpret=True)
@@ -94,10 +95,12 @@ def test_kernel_finds_the_shadows_that_rays_of_mujoco_find() -> None:
         jnp.full(len(start), 1e-4),
         jnp.asarray(distance, jnp.float32),
     )
-    found = {
-        name: np.asarray(jaxrl_vis_envs.jit(functools.partial(blocked, scene, unit), runs_once=True)(segments))
-        for name, blocked in (("plain", images._PLAIN.blocked), ("kernel", SEARCH.blocked))
-    }
+    source = Light(False, False, True, jnp.asarray((light - position) @ axes, jnp.float32), *(jnp.ones(3),) * 5, None, None)
+
+    def find(blocked: Any) -> np.ndarray:
+        return np.asarray(jaxrl_vis_envs.jit(lambda given: blocked(scene, unit, given, source), runs_once=True)(segments))
+
+    found = {"plain": find(images._PLAIN.blocked), "kernel": find(SEARCH.blocked)}
     assert 0.2 < hidden.mean() < 0.8
     np.testing.assert_array_equal(found["plain"], found["kernel"])
     assert (found["kernel"] == hidden).mean() > 0.998  # the rest: within rounding of an edge
