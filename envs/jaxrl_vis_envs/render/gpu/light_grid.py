@@ -52,9 +52,11 @@ def shadow_cells(light: Light, segments: Segments, middle: jax.Array, radius: ja
         bounds = [(at - radius, at + radius) for at in (dot(centre, axis) for axis in frame)]
     else:
         place, bounds = _around(light, segments, centre, radius)
+    order = jnp.argsort(bounds[0][0]).astype(jnp.int32)
     is_valid = segments.farthest > segments.nearest
-    masks, rows, first = [], [], 0
-    for number, (at, (low, high), count) in enumerate(zip(place, bounds, (_ACROSS, _ACROSS, _ALONG), strict=True)):
+    words, rows, first = [], [], 0
+    for number, (at, sides, count) in enumerate(zip(place, bounds, (_ACROSS, _ACROSS, _ALONG), strict=True)):
+        low, high = (side[order] for side in sides)
         least, most = (jnp.where(jnp.isnan(side), fill, side) for side, fill in ((low, np.inf), (high, -np.inf)))
         least, most = jnp.min(least), jnp.max(most)
         margin = _ROUNDING * (1.0 + jnp.maximum(jnp.abs(least), jnp.abs(most)))
@@ -64,16 +66,14 @@ def shadow_cells(light: Light, segments: Segments, middle: jax.Array, radius: ja
         mask = high + margin >= edge[:-1, None]
         if number < 2:
             mask &= low - margin <= edge[1:, None]
-        masks.append(mask)
+        words.append(pack_bits(mask))
         # No object is beyond the last cell, and before the first one in the first two coordinates.
         is_valid &= (at <= most) if number == 2 else (at >= least) & (at <= most)
         cell = jnp.clip((at - least) / pitch, 0.0, count - 1.0)
         rows.append(first + cell.astype(jnp.int32))
         first += count
-    order = jnp.argsort(bounds[0][0]).astype(jnp.int32)
-    masks.append(jnp.zeros((1, len(radius)), bool))
-    words = pack_bits(jnp.concatenate(masks)[:, order])
-    return Cells(order, words, jnp.stack([jnp.where(is_valid, row, first) for row in rows]))
+    words.append(jnp.zeros_like(words[0][:1]))
+    return Cells(order, jnp.concatenate(words), jnp.stack([jnp.where(is_valid, row, first) for row in rows]))
 
 
 def _frame(axis: Vector) -> tuple[Vector, Vector, Vector]:

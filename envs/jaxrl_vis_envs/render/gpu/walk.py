@@ -26,8 +26,8 @@ TILE = (4, 8)
 
 LANES = 32
 """Rays of a program, those of one tile."""
-# Nodes that a lane may visit, and objects that it may look at, in one step.
-_NODES, _OBJECTS = 4, 2
+# Objects that a lane may look at in one step.
+_OBJECTS = 2
 
 
 class Variant:
@@ -38,6 +38,8 @@ class Variant:
     rays = 8  # rays of each lane in a program
     shared = True  # the next free lane takes the next ray, not always the same lane
     wide = True  # loads of 16 bytes
+    camera_rays = 8  # both of the camera's rays
+    camera_nodes = 6
     nodes = 6  # nodes that a lane may visit in a step, with any_hit
 
 
@@ -154,9 +156,9 @@ def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Ar
         none, and the row of ``maps`` (int32). With ``any_hit``, only the object.
     """
     kinds = [jnp.int32] if any_hit else [jnp.float32, jnp.int32, jnp.int32]
-    count = LANES * (Variant.rays if any_hit else 1)
+    count = LANES * (Variant.rays if any_hit else Variant.camera_rays)
     return kernel_call(
-        functools.partial(_occlusion_kernel, count=count) if any_hit else _kernel,
+        functools.partial(_kernel, any_hit=any_hit, count=count),
         out_shape=[jax.ShapeDtypeStruct(refs.nearest.shape, kind) for kind in kinds],
         grid=(-(-refs.nearest.shape[0] // count),),
         in_specs=[_whole(array.shape) for array in refs],
@@ -177,23 +179,21 @@ def _whole(shape: tuple[int, ...]) -> pl.BlockSpec:
     return pl.BlockSpec(shape, lambda program: (0,) * len(shape))
 
 
-def _kernel(*refs: Any) -> None:
+def _kernel(*refs: Any, any_hit: bool, count: int) -> None:
     ins, outs = Refs(*refs[: len(Refs._fields)]), refs[len(Refs._fields) :]
-    ray = pl.program_id(0) * LANES + jax.lax.broadcasted_iota(jnp.int32, (LANES,), 0)
-    for out, value in zip(outs, _walk(ins, ray, any_hit=False), strict=True):
-        plgpu.store(out.at[ray], value)
-
-
-def _occlusion_kernel(*refs: Any, count: int) -> None:
-    ins, out = Refs(*refs[:-1]), refs[-1]
     lane = jax.lax.broadcasted_iota(jnp.int32, (LANES,), 0)
     first = pl.program_id(0) * count
+    if count == LANES:
+        for out, value in zip(outs, _walk(ins, first + lane, any_hit), strict=True):
+            plgpu.store(out.at[first + lane], value)
+        return
     end = jnp.minimum(first + count, ins.nearest.shape[0])
 
     def renew(following: jax.Array, task: _Task, state: _State) -> tuple[jax.Array, _Task, _State]:
         """Store what the finished rays have met, and give their lanes the following ones."""
         is_free = ~_is_going(task, state)
-        plgpu.store(out.at[jnp.maximum(task.ray, 0)], state.hit, mask=is_free & (task.ray >= 0))
+        for out, value in zip(outs, _found(state, any_hit), strict=True):
+            plgpu.store(out.at[jnp.maximum(task.ray, 0)], value, mask=is_free & (task.ray >= 0))
         if Variant.shared:
             rank = jnp.cumsum(is_free.astype(jnp.int32), dtype=jnp.int32)
             ray = following + rank - 1
@@ -212,7 +212,7 @@ def _occlusion_kernel(*refs: Any, count: int) -> None:
         following, task, state = jax.lax.cond(
             _any(is_free), lambda: renew(following, task, state), lambda: (following, task, state)
         )
-        return following, task, _step(ins, task, state, any_hit=True)
+        return following, task, _step(ins, task, state, any_hit)
 
     # The last rays are stored by the renewal in which no ray follows.
     begin = (first, *_begin(ins, jnp.full((LANES,), -1, jnp.int32)))
@@ -233,6 +233,11 @@ def _walk(refs: Refs, ray: jax.Array, any_hit: bool) -> list[jax.Array]:
         return _any(_is_going(task, state))
 
     state = jax.lax.while_loop(going, lambda state: _step(refs, task, state, any_hit), state)
+    return _found(state, any_hit)
+
+
+def _found(state: _State, any_hit: bool) -> list[jax.Array]:
+    """Return what `by_kernel` returns."""
     return [state.hit] if any_hit else [state.best, state.hit, state.row]
 
 
@@ -263,7 +268,7 @@ def _step(refs: Refs, task: _Task, state: _State, any_hit: bool) -> _State:
     """Let the lanes look at some objects, visit some nodes, and test the triangles of a leaf."""
     is_idle = (state.node >= state.end) & _is_looking(task, state)
     state = jax.lax.cond(_any(is_idle), lambda: _next_object(refs, task, state), lambda: state)
-    state, leaf = _visit_nodes(refs, task.nearest, state, Variant.nodes if any_hit else _NODES)
+    state, leaf = _visit_nodes(refs, task.nearest, state, Variant.nodes if any_hit else Variant.camera_nodes)
     state = jax.lax.cond(_any(leaf >= 0), lambda: _test_leaf(refs, task.nearest, state, leaf), lambda: state)
     if not any_hit:
         return state
