@@ -294,19 +294,19 @@ def _gather(ref: Any, mask: jax.Array, *place: Any) -> jax.Array:
 
 
 def _gather_four(ref: Any, mask: jax.Array, row: jax.Array, first: int = 0) -> list[jax.Array]:
-    """Load four successive columns of a row of each lane [L] where ``mask`` is set, 0 elsewhere, as `_gather` one by one.
+    """Load four successive columns of a row of each lane [L] where ``mask`` is set, and anything elsewhere.
 
     Lanes read different lines of a cache, each of which costs a cycle in every load: one load of 16 bytes takes a quarter of
     the cycles of four. The number of columns has to be a multiple of four.
     """
     if isinstance(ref, jax.Array) or not Variant.wide:
+        row = jnp.where(mask, row, 0)
         return [_gather(ref, mask, row, first + column) for column in range(4)]
     shape = (*mask.shape, 4)
     column = jax.lax.broadcasted_iota(jnp.int32, shape, 1)
     row, mask = (jnp.broadcast_to(plane[:, None], shape) for plane in (row, mask))
-    values = plgpu.load(ref.at[(row, first + column)], mask=mask, other=0.0 if ref.dtype == jnp.float32 else 0)
     # Sums of integers, because those with zeros vanish from the program. A lane holds its four columns.
-    bits = jax.lax.bitcast_convert_type(values, jnp.int32)
+    bits = jax.lax.bitcast_convert_type(plgpu.load(ref.at[(row, first + column)], mask=mask), jnp.int32)
     columns = [jnp.sum(jnp.where(column == number, bits, 0), axis=1, dtype=jnp.int32) for number in range(4)]
     return [jax.lax.bitcast_convert_type(one, ref.dtype) for one in columns]
 
@@ -362,7 +362,7 @@ def _visit_nodes(refs: Refs, nearest: jax.Array, state: _State, count: int) -> t
     node, leaf = state.node, jnp.full_like(state.node, -1)
     for _ in range(count):
         active = (node < state.end) & (leaf < 0)
-        low, high, link, _ = _gather_four(refs.nodes, active, jnp.where(active, node, 0))
+        low, high, link, _ = _gather_four(refs.nodes, active, node)
         meets = active & _meets_box(state, low, high, nearest)
         is_leaf = link < 0
         leaf = jnp.where(meets & is_leaf, -1 - link, leaf)
@@ -385,7 +385,7 @@ def _test_leaf(refs: Refs, nearest: jax.Array, state: _State, leaf: jax.Array) -
     """Intersect rays with the triangles of leaves, given by their first row of ``maps`` [L], -1 for none."""
     (start, direction), best, hit, row = state.ray[:2], state.best, state.hit, state.row
     for number in range(hierarchies.LEAF):
-        place = jnp.where(leaf >= 0, leaf + number, 0)
+        place = leaf + number
         numbers = tuple(number for column in (0, 4, 8) for number in _gather_four(refs.maps, leaf >= 0, place, column))
         slope = dot(numbers[8:11], direction)
         t = -(dot(numbers[8:11], start) + numbers[11]) / jnp.where(slope < 0.0, slope, -1.0)
