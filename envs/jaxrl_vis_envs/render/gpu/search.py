@@ -127,8 +127,7 @@ def blocked(
     start, direction = jnp.stack(segments.start), jnp.stack(segments.direction)
     valid = segments.farthest > segments.nearest
     if Variant.grid:
-        cells = light_grid.shadow_cells(light, segments, middle, radius)
-        order, words, rows = cells
+        order, words, rows = light_grid.shadow_cells(light, segments, middle, radius)
     else:
         order = jnp.arange(len(radius), dtype=jnp.int32)
         count = len(valid)
@@ -248,7 +247,8 @@ def probe_program() -> Any:
 
     def search(scene: Scene, unit: shapes.UnitShapes, one: jax.Array) -> Any:
         segments = Segments((one,) * 3, (one,) * 3, one, one)
-        light = lights.Light(True, False, True, None, -one[:3], *(one[:3],) * 3, None, None, None)
+        three = one[:3]
+        light = lights.Light(True, False, True, None, three, three, three, three, None, None, None)
         return nearest_triangle(scene, unit, Rays(one, one), one), blocked(scene, unit, segments, light, by_kernel)
 
     return jax.jit(search).trace(scene, unit, pixels)
