@@ -19,6 +19,7 @@ from jaxrl_vis_envs.render import Scene, images
 from jaxrl_vis_envs.render.gpu import search
 from jaxrl_vis_envs.render.model import hierarchies, meshes
 from jaxrl_vis_envs.render.outputs import Outputs, Planes
+from jaxrl_vis_envs.render.pixel.lights import Light
 from jaxrl_vis_envs.render.pixel.prepare import prepare
 
 KERNEL = functools.partial(search.by_kernel, interpret=True)
@@ -70,7 +71,8 @@ def test_kernel_draws_what_the_plain_renderer_draws(given: tuple, outputs: Outpu
         assert differences[same].max() <= (1.0 if name == "rgb" else 1e-4), name
 
 
-def test_kernel_finds_the_shadows_that_rays_of_mujoco_find() -> None:
+@pytest.mark.parametrize("directional", [False, True])
+def test_kernel_finds_the_shadows_that_rays_of_mujoco_find(directional: bool) -> None:
     scene, mj_model, _ = prepared()
     mj_data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, mj_data)
@@ -78,8 +80,11 @@ def test_kernel_finds_the_shadows_that_rays_of_mujoco_find() -> None:
     rng = np.random.default_rng(1)
     start = rng.uniform([-1.2, -1.2, -0.4], [1.2, 1.2, -0.3], (SIZE[0] * SIZE[1], 3))  # below all objects
     light = np.array([0.2, -0.4, 1.5])
-    distance = np.linalg.norm(light - start, axis=1)
-    direction = (light - start) / distance[:, None]
+    offset = np.broadcast_to(light, start.shape) if directional else light - start
+    distance = np.linalg.norm(offset, axis=1)
+    direction = offset / distance[:, None]
+    if directional:
+        distance[:] = np.inf
     is_fine = np.isin(mj_model.geom_type, (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD))
     mj_model.geom_group[~is_fine] = 5
     hits = [
@@ -94,10 +99,14 @@ def test_kernel_finds_the_shadows_that_rays_of_mujoco_find() -> None:
         jnp.full(len(start), 1e-4),
         jnp.asarray(distance, jnp.float32),
     )
-    found = {
-        name: np.asarray(jaxrl_vis_envs.jit(functools.partial(blocked, scene, unit), runs_once=True)(segments))
-        for name, blocked in (("plain", images._PLAIN.blocked), ("kernel", SEARCH.blocked))
-    }
+    place = None if directional else jnp.asarray((light - position) @ axes, jnp.float32)
+    towards = jnp.asarray(-(light / np.linalg.norm(light)) @ axes, jnp.float32)
+    source = Light(directional, False, True, place, towards, *(jnp.ones(3),) * 4, None, None)
+
+    def find(blocked: Any) -> np.ndarray:
+        return np.asarray(jaxrl_vis_envs.jit(lambda given: blocked(scene, unit, given, source), runs_once=True)(segments))
+
+    found = {"plain": find(images._PLAIN.blocked), "kernel": find(SEARCH.blocked)}
     assert 0.2 < hidden.mean() < 0.8
     np.testing.assert_array_equal(found["plain"], found["kernel"])
     assert (found["kernel"] == hidden).mean() > 0.998  # the rest: within rounding of an edge

@@ -254,11 +254,11 @@ def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: bl
     return Planes(colour, far if outputs.depth else None, labels, normal if outputs.normals else None, length)
 
 
-def _make_occlusion_test(scene: Scene, view: _View, shown: jax.Array) -> Callable[[triangles.Segments], jax.Array]:
+def _make_occlusion_test(scene: Scene, view: _View, shown: jax.Array) -> Callable[..., jax.Array]:
     """Return the test for triangles on segments from pixels [P], False unless ``shown``."""
 
-    def blocked(segments: triangles.Segments) -> jax.Array:
-        return view.blocked(scene, view.unit, segments._replace(farthest=jnp.where(shown, segments.farthest, 0.0)))
+    def blocked(segments: triangles.Segments, light: lights.Light) -> jax.Array:
+        return view.blocked(scene, view.unit, segments._replace(farthest=jnp.where(shown, segments.farthest, 0.0)), light)
 
     return blocked
 

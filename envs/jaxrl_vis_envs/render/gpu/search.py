@@ -14,11 +14,11 @@ import numpy as np
 from jaxrl_vis_envs.compiling.compilation import use_gpu_kernels
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
-from jaxrl_vis_envs.render.gpu import kernel
+from jaxrl_vis_envs.render.gpu import kernel, light_grid
 from jaxrl_vis_envs.render.gpu.tiles import pack_bits
-from jaxrl_vis_envs.render.gpu.walk import LANES, TILE, Refs, by_kernel, in_plain_jax
+from jaxrl_vis_envs.render.gpu.walk import LANES, TILE, Refs, Variant, by_kernel, in_plain_jax
 from jaxrl_vis_envs.render.model import hierarchies, reading
-from jaxrl_vis_envs.render.pixel import blocks, raycast, shapes
+from jaxrl_vis_envs.render.pixel import blocks, lights, raycast, shapes
 from jaxrl_vis_envs.render.pixel.arithmetic import Vector
 from jaxrl_vis_envs.render.pixel.prepare import prepare
 from jaxrl_vis_envs.render.pixel.triangles import Segments, may_meet
@@ -91,8 +91,9 @@ def nearest_triangle(
     meets = _seen_from_tiles(scene, jnp.where(is_solid, radius, np.nan)[order], middle[order])
     start, direction, _ = camera.ray_parts(scene, rays)
     axis = -unit.axes[trees.objects, :, 2] if scene.projection == "orthographic" else _apply(unit.axes[trees.objects], middle)
-    refs = _shared_refs(trees, unit, order, axis)._replace(
-        words=pack_bits(meets),
+    tile = jnp.arange(depth.shape[0], dtype=jnp.int32) // LANES
+    refs = _shared_refs(trees, unit, order, axis, pack_bits(meets))._replace(
+        rows=tile[None],
         near=near[order],
         ball=jnp.concatenate([middle, radius[:, None]], axis=1)[order],
         start=_stack(start, depth.shape),
@@ -107,36 +108,53 @@ def nearest_triangle(
     return best, jnp.where(is_hit, row, -1), jnp.where(is_hit, owner, -1)
 
 
-def blocked(scene: Scene, unit: shapes.UnitShapes, segments: Segments, walk: Walk = in_plain_jax) -> jax.Array:
+def blocked(
+    scene: Scene, unit: shapes.UnitShapes, segments: Segments, light: lights.Light, walk: Walk = in_plain_jax
+) -> jax.Array:
     """Return True where a segment enters a mesh or a height field, of any transparency: [P] bool. Not differentiable.
 
     Args:
         scene: Scene with triangles.
         unit: Rendered objects.
-        segments: [P]. Each `LANES` successive ones should start close together, and have similar directions.
+        segments: [P], towards the light, and not beyond it.
+        light: The light.
         walk: `walk.by_kernel` or `walk.in_plain_jax`.
     """
     scene, unit, segments = jax.lax.stop_gradient((scene, unit, segments))
     trees = scene.hierarchies
     assert trees is not None
-    count = segments.nearest.shape[0]
-    segments = jax.tree.map(lambda plane: jnp.pad(plane, (0, -count % LANES)), segments)  # the added ones are empty
     middle, radius = _balls(trees, unit)
-    by_tile = jax.tree.map(lambda plane: plane.reshape(-1, LANES), segments)
-    meets = jax.vmap(may_meet, in_axes=(0, None, None))(by_tile, middle, radius)
     start, direction = jnp.stack(segments.start), jnp.stack(segments.direction)
-    common = jnp.sum(jnp.where(segments.farthest > segments.nearest, direction, 0.0), axis=1)
-    order = jnp.arange(len(radius), dtype=jnp.int32)
-    refs = _shared_refs(trees, unit, order, _apply(unit.axes[trees.objects], common[None]))._replace(
-        words=pack_bits(meets),
+    valid = segments.farthest > segments.nearest
+    if Variant.grid:
+        order, words, rows = light_grid.shadow_cells(light, segments, middle, radius)
+    else:
+        order = jnp.arange(len(radius), dtype=jnp.int32)
+        count = len(valid)
+        by_tile = jax.tree.map(lambda plane: jnp.pad(plane, (0, -count % LANES)).reshape(-1, LANES), segments)
+        words = pack_bits(jax.vmap(may_meet, in_axes=(0, None, None))(by_tile, middle, radius))
+        rows = (jnp.arange(count, dtype=jnp.int32) // LANES)[None]
+    common = jnp.sum(jnp.where(valid, direction, 0.0), axis=1)
+    refs = _shared_refs(trees, unit, order, _apply(unit.axes[trees.objects], common[None]), words)._replace(
+        rows=rows,
         near=jnp.zeros_like(radius),
-        ball=jnp.concatenate([middle, radius[:, None]], axis=1),
+        ball=jnp.concatenate([middle, radius[:, None]], axis=1)[order],
         start=start,
         direction=direction,
         nearest=segments.nearest,
         farthest=segments.farthest,
     )
-    return walk(refs, any_hit=True)[0][:count] >= 0
+    return _padded(walk, refs)[: len(valid)] >= 0
+
+
+def _padded(walk: Walk, refs: Refs) -> jax.Array:
+    """Walk with the number of rays rounded up to whole tiles; the added ones meet nothing."""
+    missing = -refs.nearest.shape[0] % LANES
+    if missing:
+        rays = {name: getattr(refs, name) for name in ("rows", "start", "direction", "nearest", "farthest")}
+        rays = {name: jnp.pad(plane, [(0, 0)] * (plane.ndim - 1) + [(0, missing)]) for name, plane in rays.items()}
+        refs = refs._replace(**rays)
+    return walk(refs, any_hit=True)[0]
 
 
 def _cut(scene: Scene, plane: jax.Array) -> jax.Array:
@@ -188,7 +206,9 @@ def _seen_from_tiles(scene: Scene, radius: jax.Array, middle: jax.Array) -> jax.
     return (down[:, None] & across[None] & in_front).reshape(down.shape[0] * across.shape[0], -1)
 
 
-def _shared_refs(trees: hierarchies.Hierarchies, unit: shapes.UnitShapes, order: jax.Array, axis: jax.Array) -> Refs:
+def _shared_refs(
+    trees: hierarchies.Hierarchies, unit: shapes.UnitShapes, order: jax.Array, axis: jax.Array, words: jax.Array
+) -> Refs:
     """Return the memory blocks that all searches need, the others None.
 
     Args:
@@ -196,10 +216,16 @@ def _shared_refs(trees: hierarchies.Hierarchies, unit: shapes.UnitShapes, order:
         unit: Rendered objects.
         order: [N] int32, order of the objects.
         axis: [N, 3] float32, direction of most rays in the object's frame.
+        words: [R, words] int32, rows of bits.
     """
     octant = jnp.sum(jnp.where(axis < 0.0, np.array([1, 2, 4], np.int32), 0), axis=1, dtype=jnp.int32)
     pose = jnp.concatenate([unit.axes[trees.objects].reshape(-1, 9), unit.origin[trees.objects]], axis=1)
     blocks = dict.fromkeys(Refs._fields)
+    is_set = words != 0
+    number = np.arange(1, words.shape[1] + 1, dtype=np.int32)
+    last = jnp.max(jnp.where(is_set, number, 0), axis=1)
+    before = jnp.min(jnp.where(is_set, number - 1, words.shape[1]), axis=1)
+    blocks |= dict(words=words, span=jnp.stack([jnp.minimum(before, last), last], axis=1))
     blocks |= dict(order=order.astype(jnp.int32), pose=pose, first=trees.first + octant * trees.steps)
     blocks |= dict(steps=trees.steps, frame=trees.frame, nodes=trees.nodes, maps=trees.maps)
     return Refs(**blocks)
@@ -221,6 +247,8 @@ def probe_program() -> Any:
 
     def search(scene: Scene, unit: shapes.UnitShapes, one: jax.Array) -> Any:
         segments = Segments((one,) * 3, (one,) * 3, one, one)
-        return nearest_triangle(scene, unit, Rays(one, one), one), blocked(scene, unit, segments, by_kernel)
+        three = one[:3]
+        light = lights.Light(True, False, True, None, three, three, three, three, None, None, None)
+        return nearest_triangle(scene, unit, Rays(one, one), one), blocked(scene, unit, segments, light, by_kernel)
 
     return jax.jit(search).trace(scene, unit, pixels)

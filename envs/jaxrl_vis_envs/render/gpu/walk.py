@@ -1,8 +1,10 @@
 """GPU kernel in which rays walk bounding volume hierarchies (Pallas with Triton), see `hierarchies`.
 
 One program has one warp, and the rays of a tile of 32 pixels. Every lane walks on its own the objects that its ray may meet, in
-the order of the tile's bits, and waits for no other lane to finish an object: a step is some nodes, then the triangles of a
-leaf for the lanes that have reached one. The same code runs as plain JAX, with arrays in the place of memory blocks.
+the order of their bits, and waits for no other lane to finish an object: a step is some nodes, then the triangles of a leaf for
+the lanes that have reached one. Rays that stop at any hit differ more in length: a program has several times as many of them as
+lanes, and a lane that has finished one takes the next. The same code runs as plain JAX, with arrays in the place of memory
+blocks.
 """
 
 import functools
@@ -24,8 +26,23 @@ TILE = (4, 8)
 
 LANES = 32
 """Rays of a program, those of one tile."""
-# Nodes that a lane may visit, and objects that it may look at, in one step.
-_NODES, _OBJECTS = 4, 2
+# Objects that a lane may look at in one step.
+_OBJECTS = 2
+
+
+class Variant:
+    """Switches to measure, and then to remove."""
+
+    grid = True  # objects of a ray from a grid in the light's view, not from its tile's
+    facing = True  # no rays from surfaces that face away from the light
+    rays = 8  # rays of each lane in a program
+    shared = True  # the next free lane takes the next ray, not always the same lane
+    wide = True  # loads of 16 bytes
+    camera_rays = 8  # both of the camera's rays
+    camera_nodes = 6
+    nodes = 6  # nodes that a lane may visit in a step, with any_hit
+
+
 _COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
 # Replaces ray components of 0, by which no finite number may be divided.
 _TINY = 1e-20
@@ -34,10 +51,12 @@ _ROUNDING = 1e-6
 
 
 class Refs(NamedTuple):
-    """Memory blocks read by a program: N objects, and P rays, `LANES` of each tile.
+    """Memory blocks read by a program: N objects, and P rays.
 
     Attributes:
-        words: [tiles, words], bits of the objects that may be met from a tile.
+        words: [R, words], rows of bits of objects.
+        rows: [K, P], rows of ``words``: a ray may meet the objects whose bits are set in all of its K rows.
+        span: [R, 2], number of the first word of a row with a bit set, and of the word after the last one.
         order: [N], object of each bit; the following two are in this order, all others in that of the objects.
         near: [N], ray parameter before which no ray meets the object.
         ball: [N, 4], bounding sphere.
@@ -51,6 +70,8 @@ class Refs(NamedTuple):
     """
 
     words: Any
+    rows: Any
+    span: Any
     order: Any
     near: Any
     ball: Any
@@ -76,6 +97,25 @@ class _Ray(NamedTuple):
     direction: Vector
     inverse: Vector
     begin: Vector
+
+
+class _Task(NamedTuple):
+    """Rays of the lanes in the camera's frame, [L] each.
+
+    Attributes:
+        ray: Number of the ray, -1 for none.
+        rows: Its rows of ``words``.
+        start, direction: Vectors.
+        nearest: Ray parameter before which no intersection counts.
+        words: Number of the word after the last one with a bit of its objects.
+    """
+
+    ray: jax.Array
+    rows: tuple[jax.Array, ...]
+    start: Vector
+    direction: Vector
+    nearest: jax.Array
+    words: jax.Array
 
 
 class _State(NamedTuple):
@@ -116,10 +156,11 @@ def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Ar
         none, and the row of ``maps`` (int32). With ``any_hit``, only the object.
     """
     kinds = [jnp.int32] if any_hit else [jnp.float32, jnp.int32, jnp.int32]
+    count = LANES * (Variant.rays if any_hit else Variant.camera_rays)
     return kernel_call(
-        functools.partial(_kernel, any_hit=any_hit),
+        functools.partial(_kernel, any_hit=any_hit, count=count),
         out_shape=[jax.ShapeDtypeStruct(refs.nearest.shape, kind) for kind in kinds],
-        grid=(refs.words.shape[0],),
+        grid=(-(-refs.nearest.shape[0] // count),),
         in_specs=[_whole(array.shape) for array in refs],
         out_specs=[_whole(refs.nearest.shape) for _ in kinds],
         compiler_params=_COMPILER,
@@ -130,61 +171,113 @@ def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Ar
 
 def in_plain_jax(refs: Refs, any_hit: bool) -> list[jax.Array]:
     """Let rays walk as `by_kernel`, all at once. Those of one call should be few, and take similar ways."""
-    ray = jnp.arange(refs.nearest.shape[0], dtype=jnp.int32)
-    return _walk(refs, ray // LANES, ray, any_hit)
+    return _walk(refs, jnp.arange(refs.nearest.shape[0], dtype=jnp.int32), any_hit)
 
 
 def _whole(shape: tuple[int, ...]) -> pl.BlockSpec:
     """Return a block that gives every program the whole array."""
-    return pl.BlockSpec(shape, lambda tile_index: (0,) * len(shape))
+    return pl.BlockSpec(shape, lambda program: (0,) * len(shape))
 
 
-def _kernel(*refs: Any, any_hit: bool) -> None:
+def _kernel(*refs: Any, any_hit: bool, count: int) -> None:
     ins, outs = Refs(*refs[: len(Refs._fields)]), refs[len(Refs._fields) :]
-    tile = pl.program_id(0)
-    ray = tile * LANES + jax.lax.broadcasted_iota(jnp.int32, (LANES,), 0)
-    for out, value in zip(outs, _walk(ins, tile, ray, any_hit), strict=True):
-        plgpu.store(out.at[ray], value)
+    lane = jax.lax.broadcasted_iota(jnp.int32, (LANES,), 0)
+    first = pl.program_id(0) * count
+    if count == LANES:
+        for out, value in zip(outs, _walk(ins, first + lane, any_hit), strict=True):
+            plgpu.store(out.at[first + lane], value)
+        return
+    end = jnp.minimum(first + count, ins.nearest.shape[0])
+
+    def renew(following: jax.Array, task: _Task, state: _State) -> tuple[jax.Array, _Task, _State]:
+        """Store what the finished rays have met, and give their lanes the following ones."""
+        is_free = ~_is_going(task, state)
+        for out, value in zip(outs, _found(state, any_hit), strict=True):
+            plgpu.store(out.at[jnp.maximum(task.ray, 0)], value, mask=is_free & (task.ray >= 0))
+        if Variant.shared:
+            rank = jnp.cumsum(is_free.astype(jnp.int32), dtype=jnp.int32)
+            ray = following + rank - 1
+            following += jnp.max(rank)
+        else:
+            ray = jnp.where(task.ray >= 0, task.ray + LANES, jnp.where(following == first, first + lane, end))
+            following += LANES
+        ray = jnp.where(is_free & (ray < end), ray, -1)
+        fresh_task, fresh = _begin(ins, ray)
+        select = functools.partial(jax.tree.map, lambda new, old: jnp.where(is_free, new, old))
+        return following, select(fresh_task, task), select(fresh, state)
+
+    def advance(carry: tuple) -> tuple:
+        following, task, state = carry
+        is_free = ~_is_going(task, state) & ((task.ray >= 0) | (following == first))
+        following, task, state = jax.lax.cond(
+            _any(is_free), lambda: renew(following, task, state), lambda: (following, task, state)
+        )
+        return following, task, _step(ins, task, state, any_hit)
+
+    # The last rays are stored by the renewal in which no ray follows.
+    begin = (first, *_begin(ins, jnp.full((LANES,), -1, jnp.int32)))
+    jax.lax.while_loop(lambda carry: _any(carry[1].ray >= 0) | (carry[0] == first), advance, begin)
 
 
-def _walk(refs: Refs, tile: jax.Array, ray: jax.Array, any_hit: bool) -> list[jax.Array]:
+def _walk(refs: Refs, ray: jax.Array, any_hit: bool) -> list[jax.Array]:
     """Let some rays walk, see `by_kernel`.
 
     Args:
         refs: Memory blocks of a kernel, or arrays.
-        tile: [] or [L] int32, number of the rays' tile.
         ray: [L] int32, numbers of the rays.
         any_hit: Find any intersection, not the nearest.
     """
-    everywhere = jnp.ones(ray.shape, bool)
-    start, direction = (tuple(_gather(ref, everywhere, axis, ray) for axis in range(3)) for ref in (refs.start, refs.direction))
-    nearest, farthest = _gather(refs.nearest, everywhere, ray), _gather(refs.farthest, everywhere, ray)
-    words = refs.words.shape[1]
-
-    def is_looking(state: _State) -> jax.Array:
-        return (state.word < words) | (state.left != 0)
+    task, state = _begin(refs, ray)
 
     def going(state: _State) -> jax.Array:
-        return _any((state.node < state.end) | is_looking(state))
+        return _any(_is_going(task, state))
 
-    def advance(state: _State) -> _State:
-        is_idle = (state.node >= state.end) & is_looking(state)
-        state = jax.lax.cond(_any(is_idle), lambda: _next_object(refs, tile, start, direction, state), lambda: state)
-        state, leaf = _visit_nodes(refs, nearest, state)
-        state = jax.lax.cond(_any(leaf >= 0), lambda: _test_leaf(refs, nearest, state, leaf), lambda: state)
-        if not any_hit:
-            return state
-        done = state.hit >= 0
-        return state._replace(
-            word=jnp.where(done, words, state.word),
-            left=jnp.where(done, 0, state.left),
-            node=jnp.where(done, state.end, state.node),
-        )
+    state = jax.lax.while_loop(going, lambda state: _step(refs, task, state, any_hit), state)
+    return _found(state, any_hit)
 
-    zero, none = jnp.zeros(ray.shape, jnp.float32), jnp.zeros(ray.shape, jnp.int32)
-    begin = _State(none, none, none, none, none, _Ray(*((zero,) * 3,) * 4), farthest, none - 1, none)
-    state = jax.lax.while_loop(going, advance, begin)
+
+def _found(state: _State, any_hit: bool) -> list[jax.Array]:
+    """Return what `by_kernel` returns."""
     return [state.hit] if any_hit else [state.best, state.hit, state.row]
+
+
+def _begin(refs: Refs, ray: jax.Array) -> tuple[_Task, _State]:
+    """Return the state of lanes that begin with rays, given by their numbers [L], -1 for none."""
+    given = ray >= 0
+    place = jnp.maximum(ray, 0)
+    rows = tuple(_gather(refs.rows, given, number, place) for number in range(refs.rows.shape[0]))
+    start, direction = (tuple(_gather(ref, given, axis, place) for axis in range(3)) for ref in (refs.start, refs.direction))
+    nearest, farthest = _gather(refs.nearest, given, place), _gather(refs.farthest, given, place)
+    word, words = (_gather(refs.span, given, rows[0], side) for side in range(2))
+    zero, none = jnp.zeros(ray.shape, jnp.float32), jnp.zeros(ray.shape, jnp.int32)
+    state = _State(word, none, none, none, none, _Ray(*((zero,) * 3,) * 4), farthest, none - 1, none)
+    return _Task(ray, rows, start, direction, nearest, words), state
+
+
+def _is_looking(task: _Task, state: _State) -> jax.Array:
+    """Return True for lanes that have objects to look at, [L] bool."""
+    return (state.word < task.words) | (state.left != 0)
+
+
+def _is_going(task: _Task, state: _State) -> jax.Array:
+    """Return True for lanes that have not finished their ray, [L] bool."""
+    return (state.node < state.end) | _is_looking(task, state)
+
+
+def _step(refs: Refs, task: _Task, state: _State, any_hit: bool) -> _State:
+    """Let the lanes look at some objects, visit some nodes, and test the triangles of a leaf."""
+    is_idle = (state.node >= state.end) & _is_looking(task, state)
+    state = jax.lax.cond(_any(is_idle), lambda: _next_object(refs, task, state), lambda: state)
+    state, leaf = _visit_nodes(refs, task.nearest, state, Variant.nodes if any_hit else Variant.camera_nodes)
+    state = jax.lax.cond(_any(leaf >= 0), lambda: _test_leaf(refs, task.nearest, state, leaf), lambda: state)
+    if not any_hit:
+        return state
+    done = state.hit >= 0
+    return state._replace(
+        word=jnp.where(done, task.words, state.word),
+        left=jnp.where(done, 0, state.left),
+        node=jnp.where(done, state.end, state.node),
+    )
 
 
 def _any(mask: jax.Array) -> jax.Array:
@@ -200,25 +293,44 @@ def _gather(ref: Any, mask: jax.Array, *place: Any) -> jax.Array:
     return plgpu.load(ref.at[place], mask=mask, other=0.0 if ref.dtype == jnp.float32 else 0)
 
 
-def _next_object(refs: Refs, tile: jax.Array, start: Vector, direction: Vector, state: _State) -> _State:
+def _gather_four(ref: Any, mask: jax.Array, row: jax.Array, first: int = 0) -> list[jax.Array]:
+    """Load four successive columns of a row of each lane [L] where ``mask`` is set, and anything elsewhere.
+
+    Lanes read different lines of a cache, each of which costs a cycle in every load: one load of 16 bytes takes a quarter of
+    the cycles of four. The number of columns has to be a multiple of four.
+    """
+    if isinstance(ref, jax.Array) or not Variant.wide:
+        row = jnp.where(mask, row, 0)
+        return [_gather(ref, mask, row, first + column) for column in range(4)]
+    shape = (*mask.shape, 4)
+    column = jax.lax.broadcasted_iota(jnp.int32, shape, 1)
+    row, mask = (jnp.broadcast_to(plane[:, None], shape) for plane in (row, mask))
+    # Sums of integers, because those with zeros vanish from the program. A lane holds its four columns.
+    bits = jax.lax.bitcast_convert_type(plgpu.load(ref.at[(row, first + column)], mask=mask), jnp.int32)
+    columns = [jnp.sum(jnp.where(column == number, bits, 0), axis=1, dtype=jnp.int32) for number in range(4)]
+    return [jax.lax.bitcast_convert_type(one, ref.dtype) for one in columns]
+
+
+def _next_object(refs: Refs, task: _Task, state: _State) -> _State:
     """Give idle lanes the next object whose bounding sphere their ray meets in front of its hit, if one of the next few is."""
-    words = refs.words.shape[1]
+    start, direction, words = task.start, task.direction, task.words
     inverse_square = 1.0 / dot(direction, direction)
     idle, (word, left, walked) = state.node >= state.end, state[:2] + state[4:5]
     fresh = jnp.zeros(idle.shape, bool)
     for _ in range(_OBJECTS):
         looks = idle & ~fresh
         empty = looks & (left == 0) & (word < words)
-        left = jnp.where(empty, _gather(refs.words, empty, tile, jnp.where(empty, word, 0)), left)
+        bits = (_gather(refs.words, empty, row, jnp.where(empty, word, 0)) for row in task.rows)
+        left = jnp.where(empty, functools.reduce(jnp.bitwise_and, bits), left)
         word = jnp.where(empty, word + 1, word)
         looks &= left != 0
         place = jnp.where(looks, 32 * word - 1 - jax.lax.clz(left & -left), 0)
         left = jnp.where(looks, left & (left - 1), left)
         is_nearer = _gather(refs.near, looks, place) < state.best
-        middle = tuple(_gather(refs.ball, looks, place, axis) - start[axis] for axis in range(3))
+        *centre, radius = _gather_four(refs.ball, looks, place)
+        middle = tuple(c - s for c, s in zip(centre, start, strict=True))
         along = dot(middle, direction) * inverse_square
         apart = tuple(m - along * d for m, d in zip(middle, direction, strict=True))
-        radius = _gather(refs.ball, looks, place, 3)
         is_ahead = (along > 0.0) | (dot(middle, middle) <= radius * radius)
         takes = looks & is_nearer & is_ahead & (dot(apart, apart) <= radius * radius)
         walked = jnp.where(takes, _gather(refs.order, takes, place), walked)
@@ -232,7 +344,7 @@ def _next_object(refs: Refs, tile: jax.Array, start: Vector, direction: Vector, 
 
 def _enter(refs: Refs, start: Vector, direction: Vector, state: _State, fresh: jax.Array) -> _State:
     """Move ``fresh`` lanes to the root of the object that they now walk, and their rays to its frame."""
-    pose = [_gather(refs.pose, fresh, state.walked, column) for column in range(12)]
+    pose = [number for column in (0, 4, 8) for number in _gather_four(refs.pose, fresh, state.walked, column)]
     frame = [_gather(refs.frame, fresh, state.walked, column) for column in range(6)]
     axes = [pose[3 * row : 3 * row + 3] for row in range(3)]
     own_direction = camera.multiply(axes, direction)
@@ -245,12 +357,12 @@ def _enter(refs: Refs, start: Vector, direction: Vector, state: _State, fresh: j
     return state._replace(node=jnp.where(fresh, first, state.node), end=jnp.where(fresh, first + steps, state.end), ray=ray)
 
 
-def _visit_nodes(refs: Refs, nearest: jax.Array, state: _State) -> tuple[_State, jax.Array]:
-    """Visit some nodes; return the state and, for lanes that have met a leaf, its first row of ``maps`` [L], -1 for others."""
+def _visit_nodes(refs: Refs, nearest: jax.Array, state: _State, count: int) -> tuple[_State, jax.Array]:
+    """Visit ``count`` nodes; return the state and the first row of ``maps`` [L] of the leaf that a lane has met, else -1."""
     node, leaf = state.node, jnp.full_like(state.node, -1)
-    for _ in range(_NODES):
+    for _ in range(count):
         active = (node < state.end) & (leaf < 0)
-        low, high, link = (_gather(refs.nodes, active, jnp.where(active, node, 0), word) for word in range(3))
+        low, high, link, _ = _gather_four(refs.nodes, active, node)
         meets = active & _meets_box(state, low, high, nearest)
         is_leaf = link < 0
         leaf = jnp.where(meets & is_leaf, -1 - link, leaf)
@@ -273,8 +385,8 @@ def _test_leaf(refs: Refs, nearest: jax.Array, state: _State, leaf: jax.Array) -
     """Intersect rays with the triangles of leaves, given by their first row of ``maps`` [L], -1 for none."""
     (start, direction), best, hit, row = state.ray[:2], state.best, state.hit, state.row
     for number in range(hierarchies.LEAF):
-        place = jnp.where(leaf >= 0, leaf + number, 0)
-        numbers = tuple(_gather(refs.maps, leaf >= 0, place, column) for column in range(12))
+        place = leaf + number
+        numbers = tuple(number for column in (0, 4, 8) for number in _gather_four(refs.maps, leaf >= 0, place, column))
         slope = dot(numbers[8:11], direction)
         t = -(dot(numbers[8:11], start) + numbers[11]) / jnp.where(slope < 0.0, slope, -1.0)
         point = tuple(s + t * d for s, d in zip(start, direction, strict=True))

@@ -156,6 +156,23 @@ def light_vector(light: Light, point: Vector) -> tuple[Vector, jax.Array | None,
     return tuple(component * inverse for component in offset), distance_square * inverse, inverse
 
 
+def may_brighten(light: Light, point: Vector, normal: Vector) -> jax.Array:
+    """Return False where a light adds nothing to a surface point, [P] bool: where `light_factors` times its colours are 0.
+
+    Args:
+        light: The light.
+        point: Surface point in the camera's frame.
+        normal: Unit outward normal.
+    """
+    to_light, _, _ = light_vector(light, point)
+    brightens = dot(normal, to_light) > 0.0
+    for channel in range(3):
+        brightens = brightens | (light.ambient[channel] != 0.0)
+    if light.cosine_cutoff is None:
+        return brightens
+    return brightens & (-dot(to_light, tuple(light.direction[axis] for axis in range(3))) >= light.cosine_cutoff)
+
+
 def light_factors(
     light: Light, point: Vector, normal: Vector, to_camera: Vector, exponent: jax.Array, lit: jax.Array | None
 ) -> tuple:

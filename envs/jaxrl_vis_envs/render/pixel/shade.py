@@ -7,7 +7,8 @@ tessellates and lights likewise, are lit at every pixel. There are no reflection
 (MuJoCo's renderer does not support point lights).
 """
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -16,6 +17,7 @@ import numpy as np
 
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.gpu.walk import Variant
 from jaxrl_vis_envs.render.pixel import charts, sampling, shapes, surface, texturing
 from jaxrl_vis_envs.render.pixel import lights as lighting
 from jaxrl_vis_envs.render.pixel.arithmetic import Vector, clip_to_unit, normalized
@@ -25,7 +27,7 @@ from jaxrl_vis_envs.render.pixel.surface import Hit
 from jaxrl_vis_envs.render.pixel.triangles import Segments
 from jaxrl_vis_envs.render.scene import Scene
 
-Blocked = Callable[[Segments], jax.Array]
+Blocked = Callable[[Segments, lighting.Light], jax.Array]
 
 # Ambient light that MuJoCo uses in a scene without any light.
 _AMBIENT_WITHOUT_LIGHTS = 0.3
@@ -66,7 +68,8 @@ def light_surface(
         row: Object at each pixel.
         hit: Intersection at each pixel.
         rays: [P].
-        blocked: Function that returns True where segments [P] meet a triangle; None if there are no triangles or no shadows.
+        blocked: Function that returns True where segments [P] to a light meet a triangle; None if there are no triangles or no
+            shadows.
 
     Returns:
         Red, green and blue, each [P] float32 in [0, 1].
@@ -79,9 +82,10 @@ def light_surface(
             to_camera = normalized((-u, -v, jnp.ones_like(u)))
         return _light_points(scene, unit, lights, row, hit, to_camera)
     # Corners are lit, but shadows fall on points.
-    lit = [_shadow_mask(scene, unit, light, hit, blocked) if light.shadows else None for light in lights]
+    corners = surface.corners(row, hit)
+    lit = [_shadow_mask(scene, unit, light, hit, blocked, corners) if light.shadows else None for light in lights]
     colour: Vector = (0.0, 0.0, 0.0)
-    for share, corner in surface.corners(row, hit):
+    for share, corner in corners:
         to_camera = normalized(tuple(-p for p in corner.point))
         corner_colour = _light_points(scene, unit, lights, row, corner, to_camera, lit)
         colour = tuple(total + share * value for total, value in zip(colour, corner_colour, strict=True))
@@ -120,9 +124,17 @@ def _light_points(
 
 
 def _shadow_mask(
-    scene: Scene, unit: shapes.UnitShapes | None, light: lighting.Light, hit: Hit, blocked: Blocked | None
+    scene: Scene,
+    unit: shapes.UnitShapes | None,
+    light: lighting.Light,
+    hit: Hit,
+    blocked: Blocked | None,
+    corners: Iterable[tuple[jax.Array, Hit]] = (),
 ) -> jax.Array:
-    """Return 0 where a geom or tendon occludes the light, else 1: [P] float32. Sites cast no shadow."""
+    """Return 0 where a geom or tendon occludes the light, else 1: [P] float32. Sites cast no shadow.
+
+    The triangles of meshes are omitted where the light brightens none of the ``corners``, with or without them.
+    """
     assert unit is not None
     to_light, distance, _ = lighting.light_vector(light, hit.point)
     start = tuple(jax.lax.stop_gradient(p) for p in hit.point)
@@ -139,9 +151,12 @@ def _shadow_mask(
         blocks = meets & (t > margin)
         shadowed = shadowed | (blocks if distance is None else blocks & (t < distance))
     if blocked is not None:
-        farthest = jnp.full_like(margin, np.inf) if distance is None else distance
+        farthest = jnp.full_like(margin, np.inf) if distance is None else jax.lax.stop_gradient(distance)
+        if Variant.facing:
+            brightens = [lighting.may_brighten(light, corner.point, corner.normal) for _, corner in corners]
+            farthest = jnp.where(jax.lax.stop_gradient(functools.reduce(jnp.logical_or, brightens)), farthest, 0.0)
         to_light = tuple(jnp.broadcast_to(component, margin.shape) for component in to_light)
-        shadowed = shadowed | blocked(Segments(start, to_light, margin, jax.lax.stop_gradient(farthest)))
+        shadowed = shadowed | blocked(Segments(start, to_light, margin, farthest), light)
     return 1.0 - shadowed.astype(jnp.float32)
 
 
