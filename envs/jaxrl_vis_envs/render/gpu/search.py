@@ -16,12 +16,12 @@ from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.gpu import kernel, light_grid
 from jaxrl_vis_envs.render.gpu.tiles import pack_bits
-from jaxrl_vis_envs.render.gpu.walk import LANES, TILE, Refs, Variant, by_kernel, in_plain_jax
+from jaxrl_vis_envs.render.gpu.walk import LANES, TILE, Refs, by_kernel, in_plain_jax
 from jaxrl_vis_envs.render.model import hierarchies, reading
 from jaxrl_vis_envs.render.pixel import blocks, lights, raycast, shapes
 from jaxrl_vis_envs.render.pixel.arithmetic import Vector
 from jaxrl_vis_envs.render.pixel.prepare import prepare
-from jaxrl_vis_envs.render.pixel.triangles import Segments, may_meet
+from jaxrl_vis_envs.render.pixel.triangles import Segments
 from jaxrl_vis_envs.render.scene import Scene
 
 Walk = Callable[..., list[jax.Array]]
@@ -126,14 +126,7 @@ def blocked(
     middle, radius = _balls(trees, unit)
     start, direction = jnp.stack(segments.start), jnp.stack(segments.direction)
     valid = segments.farthest > segments.nearest
-    if Variant.grid:
-        order, words, rows = light_grid.shadow_cells(light, segments, middle, radius)
-    else:
-        order = jnp.arange(len(radius), dtype=jnp.int32)
-        count = len(valid)
-        by_tile = jax.tree.map(lambda plane: jnp.pad(plane, (0, -count % LANES)).reshape(-1, LANES), segments)
-        words = pack_bits(jax.vmap(may_meet, in_axes=(0, None, None))(by_tile, middle, radius))
-        rows = (jnp.arange(count, dtype=jnp.int32) // LANES)[None]
+    order, words, rows = light_grid.shadow_cells(light, segments, middle, radius)
     common = jnp.sum(jnp.where(valid, direction, 0.0), axis=1)
     refs = _shared_refs(trees, unit, order, _apply(unit.axes[trees.objects], common[None]), words)._replace(
         rows=rows,

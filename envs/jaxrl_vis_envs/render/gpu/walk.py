@@ -1,10 +1,9 @@
 """GPU kernel in which rays walk bounding volume hierarchies (Pallas with Triton), see `hierarchies`.
 
-One program has one warp, and the rays of a tile of 32 pixels. Every lane walks on its own the objects that its ray may meet, in
-the order of their bits, and waits for no other lane to finish an object: a step is some nodes, then the triangles of a leaf for
-the lanes that have reached one. Rays that stop at any hit differ more in length: a program has several times as many of them as
-lanes, and a lane that has finished one takes the next. The same code runs as plain JAX, with arrays in the place of memory
-blocks.
+One program has one warp, and several times as many rays as lanes. Every lane traverses on its own the objects that its ray may
+meet, in the order of their bits, and waits for no other lane to finish an object: a step is some nodes, then the triangles of a
+leaf for the lanes that have reached one. A lane that has finished its ray takes the next one. The same code runs as plain JAX,
+with arrays in the place of memory blocks.
 """
 
 import functools
@@ -25,23 +24,11 @@ TILE = (4, 8)
 """Rows and columns of a tile. Tuned on an H100, as are the following."""
 
 LANES = 32
-"""Rays of a program, those of one tile."""
-# Objects that a lane may look at in one step.
-_OBJECTS = 2
-
-
-class Variant:
-    """Switches to measure, and then to remove."""
-
-    grid = True  # objects of a ray from a grid in the light's view, not from its tile's
-    facing = True  # no rays from surfaces that face away from the light
-    rays = 8  # rays of each lane in a program
-    shared = True  # the next free lane takes the next ray, not always the same lane
-    wide = True  # loads of 16 bytes
-    camera_rays = 8  # both of the camera's rays
-    camera_nodes = 6
-    nodes = 6  # nodes that a lane may visit in a step, with any_hit
-
+"""Lanes of a program, and pixels of a tile."""
+RAYS = 8
+"""Rays of a lane, on average: a lane that has finished one takes the program's next."""
+# Objects that a lane may look at, and nodes that it may visit, in one step.
+_OBJECTS, _NODES = 2, 6
 
 _COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
 # Replaces ray components of 0, by which no finite number may be divided.
@@ -144,7 +131,7 @@ class _State(NamedTuple):
 
 
 def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Array]:
-    """Let rays walk, by the kernel.
+    """Traverse the hierarchies along rays, by the kernel.
 
     Args:
         refs: Arrays that describe rays and objects.
@@ -156,9 +143,9 @@ def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Ar
         none, and the row of ``maps`` (int32). With ``any_hit``, only the object.
     """
     kinds = [jnp.int32] if any_hit else [jnp.float32, jnp.int32, jnp.int32]
-    count = LANES * (Variant.rays if any_hit else Variant.camera_rays)
+    count = LANES * RAYS
     return kernel_call(
-        functools.partial(_kernel, any_hit=any_hit, count=count),
+        functools.partial(_kernel, any_hit=any_hit),
         out_shape=[jax.ShapeDtypeStruct(refs.nearest.shape, kind) for kind in kinds],
         grid=(-(-refs.nearest.shape[0] // count),),
         in_specs=[_whole(array.shape) for array in refs],
@@ -170,7 +157,7 @@ def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Ar
 
 
 def in_plain_jax(refs: Refs, any_hit: bool) -> list[jax.Array]:
-    """Let rays walk as `by_kernel`, all at once. Those of one call should be few, and take similar ways."""
+    """Traverse the hierarchies as `by_kernel`, along all rays at once. Rays of one call should be few, and coherent."""
     return _walk(refs, jnp.arange(refs.nearest.shape[0], dtype=jnp.int32), any_hit)
 
 
@@ -179,28 +166,19 @@ def _whole(shape: tuple[int, ...]) -> pl.BlockSpec:
     return pl.BlockSpec(shape, lambda program: (0,) * len(shape))
 
 
-def _kernel(*refs: Any, any_hit: bool, count: int) -> None:
+def _kernel(*refs: Any, any_hit: bool) -> None:
     ins, outs = Refs(*refs[: len(Refs._fields)]), refs[len(Refs._fields) :]
-    lane = jax.lax.broadcasted_iota(jnp.int32, (LANES,), 0)
-    first = pl.program_id(0) * count
-    if count == LANES:
-        for out, value in zip(outs, _walk(ins, first + lane, any_hit), strict=True):
-            plgpu.store(out.at[first + lane], value)
-        return
-    end = jnp.minimum(first + count, ins.nearest.shape[0])
+    first = pl.program_id(0) * LANES * RAYS
+    end = jnp.minimum(first + LANES * RAYS, ins.nearest.shape[0])
 
     def renew(following: jax.Array, task: _Task, state: _State) -> tuple[jax.Array, _Task, _State]:
         """Store what the finished rays have met, and give their lanes the following ones."""
         is_free = ~_is_going(task, state)
         for out, value in zip(outs, _found(state, any_hit), strict=True):
             plgpu.store(out.at[jnp.maximum(task.ray, 0)], value, mask=is_free & (task.ray >= 0))
-        if Variant.shared:
-            rank = jnp.cumsum(is_free.astype(jnp.int32), dtype=jnp.int32)
-            ray = following + rank - 1
-            following += jnp.max(rank)
-        else:
-            ray = jnp.where(task.ray >= 0, task.ray + LANES, jnp.where(following == first, first + lane, end))
-            following += LANES
+        rank = jnp.cumsum(is_free.astype(jnp.int32), dtype=jnp.int32)
+        ray = following + rank - 1
+        following += jnp.max(rank)
         ray = jnp.where(is_free & (ray < end), ray, -1)
         fresh_task, fresh = _begin(ins, ray)
         select = functools.partial(jax.tree.map, lambda new, old: jnp.where(is_free, new, old))
@@ -220,7 +198,7 @@ def _kernel(*refs: Any, any_hit: bool, count: int) -> None:
 
 
 def _walk(refs: Refs, ray: jax.Array, any_hit: bool) -> list[jax.Array]:
-    """Let some rays walk, see `by_kernel`.
+    """Traverse the hierarchies along some rays, see `by_kernel`.
 
     Args:
         refs: Memory blocks of a kernel, or arrays.
@@ -268,7 +246,7 @@ def _step(refs: Refs, task: _Task, state: _State, any_hit: bool) -> _State:
     """Let the lanes look at some objects, visit some nodes, and test the triangles of a leaf."""
     is_idle = (state.node >= state.end) & _is_looking(task, state)
     state = jax.lax.cond(_any(is_idle), lambda: _next_object(refs, task, state), lambda: state)
-    state, leaf = _visit_nodes(refs, task.nearest, state, Variant.nodes if any_hit else Variant.camera_nodes)
+    state, leaf = _visit_nodes(refs, task.nearest, state)
     state = jax.lax.cond(_any(leaf >= 0), lambda: _test_leaf(refs, task.nearest, state, leaf), lambda: state)
     if not any_hit:
         return state
@@ -281,7 +259,7 @@ def _step(refs: Refs, task: _Task, state: _State, any_hit: bool) -> _State:
 
 
 def _any(mask: jax.Array) -> jax.Array:
-    """Return True if a lane's mask is set, [] bool."""
+    """Return True if the mask of any lane is set, [] bool."""
     return jnp.max(mask.astype(jnp.int32)) > 0
 
 
@@ -299,7 +277,7 @@ def _gather_four(ref: Any, mask: jax.Array, row: jax.Array, first: int = 0) -> l
     Lanes read different lines of a cache, each of which costs a cycle in every load: one load of 16 bytes takes a quarter of
     the cycles of four. The number of columns has to be a multiple of four.
     """
-    if isinstance(ref, jax.Array) or not Variant.wide:
+    if isinstance(ref, jax.Array):
         row = jnp.where(mask, row, 0)
         return [_gather(ref, mask, row, first + column) for column in range(4)]
     shape = (*mask.shape, 4)
@@ -357,10 +335,10 @@ def _enter(refs: Refs, start: Vector, direction: Vector, state: _State, fresh: j
     return state._replace(node=jnp.where(fresh, first, state.node), end=jnp.where(fresh, first + steps, state.end), ray=ray)
 
 
-def _visit_nodes(refs: Refs, nearest: jax.Array, state: _State, count: int) -> tuple[_State, jax.Array]:
-    """Visit ``count`` nodes; return the state and the first row of ``maps`` [L] of the leaf that a lane has met, else -1."""
+def _visit_nodes(refs: Refs, nearest: jax.Array, state: _State) -> tuple[_State, jax.Array]:
+    """Visit some nodes; return the state and the first row of ``maps`` [L] of the leaf that a lane has met, else -1."""
     node, leaf = state.node, jnp.full_like(state.node, -1)
-    for _ in range(count):
+    for _ in range(_NODES):
         active = (node < state.end) & (leaf < 0)
         low, high, link, _ = _gather_four(refs.nodes, active, node)
         meets = active & _meets_box(state, low, high, nearest)

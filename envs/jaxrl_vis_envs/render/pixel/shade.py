@@ -17,7 +17,6 @@ import numpy as np
 
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
-from jaxrl_vis_envs.render.gpu.walk import Variant
 from jaxrl_vis_envs.render.pixel import charts, sampling, shapes, surface, texturing
 from jaxrl_vis_envs.render.pixel import lights as lighting
 from jaxrl_vis_envs.render.pixel.arithmetic import Vector, clip_to_unit, normalized
@@ -152,9 +151,8 @@ def _shadow_mask(
         shadowed = shadowed | (blocks if distance is None else blocks & (t < distance))
     if blocked is not None:
         farthest = jnp.full_like(margin, np.inf) if distance is None else jax.lax.stop_gradient(distance)
-        if Variant.facing:
-            brightens = [lighting.may_brighten(light, corner.point, corner.normal) for _, corner in corners]
-            farthest = jnp.where(jax.lax.stop_gradient(functools.reduce(jnp.logical_or, brightens)), farthest, 0.0)
+        brightens = [lighting.may_brighten(light, corner.point, corner.normal) for _, corner in corners]
+        farthest = jnp.where(jax.lax.stop_gradient(functools.reduce(jnp.logical_or, brightens)), farthest, 0.0)
         to_light = tuple(jnp.broadcast_to(component, margin.shape) for component in to_light)
         shadowed = shadowed | blocked(Segments(start, to_light, margin, farthest), light)
     return 1.0 - shadowed.astype(jnp.float32)

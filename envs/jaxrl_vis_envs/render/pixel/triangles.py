@@ -15,7 +15,7 @@ from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.model import meshes, reading
 from jaxrl_vis_envs.render.pixel import shapes
-from jaxrl_vis_envs.render.pixel.arithmetic import Vector, dot, normalized
+from jaxrl_vis_envs.render.pixel.arithmetic import Vector
 from jaxrl_vis_envs.render.scene import Scene
 
 SEAM = 1e-5
@@ -221,38 +221,6 @@ def next_triangle(
     start = (jnp.zeros((), jnp.int32), jnp.ones_like(depth), jnp.full(rays.u.shape, unset, jnp.int32))
     _, depths, rows = jax.lax.while_loop(lambda state: state[0] < counts[last], advance, start)
     return depths, jnp.where(rows == unset, -1, rows)
-
-
-def may_meet(segments: Segments, middle: jax.Array, radius: jax.Array) -> jax.Array:
-    """Test which spheres the segments may meet (conservative).
-
-    Args:
-        segments: [P].
-        middle: [K, 3] float32, m, centres in the camera's frame.
-        radius: [K] float32, m.
-
-    Returns:
-        [K] bool.
-    """
-    valid = segments.farthest > segments.nearest
-    # By components, which XLA fuses with the comparisons: tiles times spheres would be large arrays.
-    low = [jnp.min(jnp.where(valid, component, np.inf)) for component in segments.start]
-    high = [jnp.max(jnp.where(valid, component, -np.inf)) for component in segments.start]
-    size = tuple(one - other for one, other in zip(high, low, strict=True))
-    reach = radius * (1.0 + 1e-4) + 0.5 * jnp.sqrt(dot(size, size)) + 1e-5
-    axis = normalized(tuple(jnp.sum(jnp.where(valid, component, 0.0)) for component in segments.direction))
-    turn = tuple(component - a for component, a in zip(segments.direction, axis, strict=True))
-    # At a distance of t, segments are within the radius of their starts plus spread * t around the axis.
-    spread = jnp.sqrt(jnp.max(jnp.where(valid, dot(turn, turn), 0.0)))
-    farthest = jnp.max(jnp.where(valid, segments.farthest, 0.0))
-    # Not a number without any segment.
-    offset = tuple(middle[:, i] - 0.5 * (low[i] + high[i]) for i in range(3))
-    along = dot(offset, axis)
-    aside = tuple(o - along * a for o, a in zip(offset, axis, strict=True))
-    beyond = (along + reach) / jnp.maximum(1.0 - spread, 0.1)
-    is_near = (jnp.sqrt(dot(aside, aside)) <= reach + spread * beyond) & (along >= -reach)
-    is_near &= along <= farthest * (1.0 + spread) + reach
-    return is_near | ((spread > 0.9) & jnp.any(valid))
 
 
 def _intersect_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays) -> jax.Array:
