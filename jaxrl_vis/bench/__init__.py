@@ -2,9 +2,9 @@
 
     settings -> render | physics | env | update | train -> Measurement -> record
 
-Every benchmark varies the state of each environment, asserts that the results differ, warms up, waits for the device, repeats,
-and reports the median; compilation is timed separately. `conditions` decides which figures are comparable, and `record` stores
-them and prints each change. `scenes` measures the renderer on scenes that other renderers draw as well.
+States of environments, images and episodes of the replay differ, which is asserted. Every benchmark warms up, waits for the
+device, repeats, and reports the median; compilation is timed separately. `conditions` decides which figures are comparable, and
+`record` stores them and prints each change. `scenes` measures the renderer on scenes that other renderers draw as well.
 
 The other renderers and learners (`benchmarks.peers`) and the tables that are written from records (`benchmarks.ledger`) are
 not part of the package: they run from a checkout.

@@ -193,7 +193,7 @@ def check_range(path: Path, name: str, values: tuple[float, ...], low: float, hi
         step: Divisor of each number, for whole numbers.
 
     Raises:
-        RequestError: A number is out of range, or there are none or more than 16.
+        RequestError: A number is out of range or not divisible by ``step``, or there are none or more than 16.
     """
     unfit = next((value for value in values if not low <= value <= high or (step > 1 and value % step)), None)
     if unfit is not None or not 1 <= len(values) <= 16:

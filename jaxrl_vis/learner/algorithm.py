@@ -33,12 +33,13 @@ class Setup:
 
     Attributes:
         config: Configuration of the run.
-        resolved: Discount, rewards, bounds of targets.
+        resolved: Discount, rewards and bounds of targets derived from ``config``.
         observation_spec: Shape and dtype of an observation: [C, H, W] uint8 or [S] float32.
         action_size: A; actions lie in [-1, 1].
         auxiliary: Auxiliary tasks of the run and their weighting; an algorithm may ignore them.
-        shards: Shards of the learner: batches are those of one shard, gradients and metrics must be those of the whole.
-        critic_state_size: P, size of the true states that the critic observes instead of images; 0 for what the actor observes.
+        shards: Shards of the learner: each reads its own batches, and the algorithm averages gradients and metrics over them.
+        critic_state_size: P, size of the true states that the critic observes instead of images; 0 if it observes the same as
+            the actor.
     """
 
     config: Config

@@ -167,7 +167,7 @@ class RunLoop:
             self._folder.check_ownership(self._checkpoints.run_id, self._lock)
 
     def _ownership_error(self) -> FolderGoneError | None:
-        """Return why nothing can be saved any more; None if the run folder still belongs to this run."""
+        """Return the error if the run folder no longer belongs to this run, and remove the progress bar; None if it does."""
         try:
             self._check_ownership()
         except FolderGoneError as gone:

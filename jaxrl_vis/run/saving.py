@@ -65,7 +65,7 @@ class Saver:
         return distributed.any_process(iteration in self._checkpoints.iterations(tier))
 
     def save_light(self, loop: LoopState, iteration: int, progress: Progress) -> None:
-        """Save the learner in the background.
+        """Save the learner in the background; without a ``full_checkpoint_interval``, delete older full checkpoints.
 
         Raises:
             NonFiniteError: The state is not finite; it was dumped instead.

@@ -19,10 +19,10 @@ class Evaluation(NamedTuple):
     """Result of an evaluation.
 
     Attributes:
-        metrics: [S] float32 by name: means over all episodes, as ``eval/`` and a name of `GoalEnv.metric_names`, and
+        metrics: [S] float32 by name, over all episodes: means of `GoalEnv.metric_names`, each prefixed by ``eval/``, and
             ``eval/goal_distance_median``.
-        recording: ``frames`` [S, K, T+1, ...], ``goals`` [S, K, ...] and ``success`` [S, K] of the first K episodes of each
-            shard of each seed (`num_recorded`).
+        recording: ``frames`` [S, K, T+1, ...], ``goals`` [S, K, ...] and ``success`` [S, K] of the first K episodes of one
+            shard of each seed (`num_recorded`), without older stacked images; D * K episodes once D shards are assembled.
     """
 
     metrics: Metrics

@@ -47,7 +47,7 @@ class Agent(Replaceable):
 
     Attributes:
         actor, critic: Online parameters. The actor is only a head if it shares the critic's encoder.
-        target_actor, target_critic: Slowly updated copies; only heads without target encoders.
+        target_actor, target_critic: Slowly updated copies; without target encoders, of the heads only.
         actor_optimizer, critic_optimizer: optax states.
         updates: [] int32, number of gradient steps taken (below 2^31 in any realistic run).
         weighting: `weighting.WeightingState` of the auxiliary losses; None without a weighting.
@@ -335,7 +335,7 @@ def _mean(values: list[jax.Array]) -> jax.Array:
 
 
 def make(setup: Setup) -> Algorithm:
-    """Build DDPG."""
+    """Build DDPG; errors as in `make_learned_reward`."""
     return build(setup)
 
 

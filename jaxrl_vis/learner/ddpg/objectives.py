@@ -250,7 +250,8 @@ class Objectives:
 
         Args:
             copies: Parameters of the networks.
-            of_actor, of_critic: What the target actor and the target critic read after the transition (`Networks.values`).
+            of_actor, of_critic: Inputs of the heads of the target actor and the target critic after the transition: latents
+                [2, B, latent] of observations and goals, or true states if the critic observes these (`Networks.values`).
             batch: Transitions with rewards.
             noise: [B, A], added to the next actions; None for no noise.
         """

@@ -62,6 +62,9 @@ def export_run(
         seed, checkpoint, trust: As in `load_policy`.
         overwrite: Whether to replace an exported policy in ``out``.
 
+    Returns:
+        The result of `check_file` on the written folder.
+
     Raises:
         RequestError: The run cannot be used, the policy does not support the format, a library is missing, or ``out`` is not
             empty.

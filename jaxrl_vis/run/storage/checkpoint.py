@@ -8,7 +8,8 @@
 Each checkpoint has a manifest: names, shapes, dtypes and checksums of all arrays, and the host's progress. orbax makes a folder
 appear under its final name only when it is complete; the checksums detect later damage, such as a flipped byte, which would
 otherwise be restored silently. After the background write, SHA256SUMS (`sums`) is added for `verification`, also of data that
-is never restored. The newest two light ones and the newest two full ones are kept.
+is never restored. The newest two light and the newest two full checkpoints are kept; without a ``full_checkpoint_interval``, a
+full one (written on interruption) is deleted once a newer light one is on the disk, see `Checkpoints.retire_full`.
 
 A run resumes from the newest valid full, recent or light checkpoint; ties are broken in this order. Checkpoints newer than the
 one resumed from are never deleted: damaged ones are moved to checkpoints/damaged/, and those of another run, identified by
@@ -60,8 +61,8 @@ class Checkpoints:
         read_only: Whether to only read: nothing is saved, created or cleaned up.
 
     Attributes:
-        run_id: Id of the run: other runs' checkpoints are ignored, except by
-            `set_foreign_aside`. `ANY_RUN`: all checkpoints.
+        run_id: Id of the run: other runs' checkpoints are ignored, except by `set_foreign_aside`. `ANY_RUN`: all checkpoints.
+        recent: Recent states of the run.
     """
 
     def __init__(
@@ -145,6 +146,9 @@ class Checkpoints:
             iteration: Iterations completed.
             train: The learner, [S, ...].
             progress: A JSON value.
+
+        Raises:
+            StorageError: It cannot be written, or an earlier light checkpoint could not.
         """
         self._save(LIGHT, iteration, {"train": saved_leaves(train, copy=True)}, progress)
 
@@ -329,7 +333,7 @@ class Checkpoints:
         return self._newest_good(template, with_replay=False, requested=iteration)
 
     def manifest(self, tier: str, iteration: int) -> dict[str, Any]:
-        """Return the manifest of a checkpoint: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
+        """Return a checkpoint's manifest: ``schema``, ``run_id``, ``iteration``, ``items`` (`arrays.describe`), ``progress``.
 
         Raises:
             RequestError: The checkpoint is damaged, or of another schema.

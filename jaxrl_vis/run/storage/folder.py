@@ -31,7 +31,7 @@ from jaxrl_vis.run.storage.metrics import RUN_ID, read_rows
 SCHEMA = 2
 
 CHECKPOINT_FOLDERS = ("light", "full", "best", "recent", "damaged", "replaced")
-"""Subfolders written by `checkpoint`."""
+"""Subfolders of checkpoints/ that are deleted with their run; foreign/, with those of other runs, is kept."""
 
 _UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written
 

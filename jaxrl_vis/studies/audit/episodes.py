@@ -26,9 +26,9 @@ class Episodes(NamedTuple):
     """E episodes of T steps.
 
     Attributes:
-        images: [E, T+1, ...] observations.
+        images: [E, T+1, C, H, W] uint8, observations.
         states: [E, T+1, G] float32, true states.
-        goals: [E, ...] goal images that were given.
+        goals: [E, C, H, W] uint8, goal images that were given.
         goal_states: [E, G] float32, true states of these goals.
     """
 
@@ -42,7 +42,7 @@ class Pairs(NamedTuple):
     """N pairs of an image and a goal image.
 
     Attributes:
-        images, goals: [N, ...].
+        images, goals: [N, C, H, W] uint8.
         distance: [N] float32, true distance, in the task's unit.
     """
 
@@ -134,7 +134,15 @@ def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:
 
 
 def search(env: GoalEnv, reward: Reward, goals: int, sequences: int, seed: int) -> SearchResult:
-    """Search for actions that maximise a reward at the end of an episode, ``sequences`` random ones for each of ``goals``."""
+    """Search for actions that maximise a reward at the end of an episode; return NumPy arrays.
+
+    Args:
+        env: Environment of the task.
+        reward: Reward to maximise.
+        goals: E, number of goals, each with a start of its own.
+        sequences: Number of random sequences of actions for each goal.
+        seed: Seed of goals, starts and actions.
+    """
 
     def of_goal(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         start_key, action_key = jax.random.split(key)

@@ -80,7 +80,8 @@ def run_cells(
     """Train unfinished cells; resume those already started.
 
     Args:
-        cells: Cells to train: longest first, so that devices finish at about the same time, otherwise in this order.
+        cells: Cells to train; the longest are started first, so that devices finish at about the same time, and equally long
+            ones in this order.
         runs: Folder of the run folders.
         find_devices: Function that returns the devices, each of which runs one process at a time; called only if there are
             unfinished cells.
