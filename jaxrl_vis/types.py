@@ -2,7 +2,7 @@
 
     E  environments in a rollout          B  transitions in a batch       C, H, W  channels, height, width of an image
     N  episodes that the replay holds     A  action components            G        components of the true goal state
-    T  control steps of an episode        S  seeds trained in parallel    P        G plus components of the task's true state
+    T  control steps of an episode        S  seeds trained in parallel    P        G plus components of ``full_states``
 
 An observation is a planar image [C, H, W] uint8 or a state vector [S] float32; "..." stands for its own axes.
 """

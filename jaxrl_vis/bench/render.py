@@ -31,7 +31,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
     """Yield images per second for each size, output and batch: of the scene if one is set, else of the environment.
 
     Raises:
-        RequestError: The environment does not observe images, or as in `scenes.models.load`.
+        RequestError: The environment does not observe images; for a scene, see `scenes.models.load`.
     """
     if settings.scene is not None:
         yield from scene_images.measure(settings, image_sizes(settings))

@@ -41,9 +41,9 @@ class Figure:
     """A .png, .pdf or .svg file; figure_FIGURE.png (or quadratic.png, pareto.png) in the current folder if not given. Tables of
     training runs are written beside it, as .md and .csv."""
     preset: str | None = None
-    """Preset of all runs; paper for figures 5.4 to 5.7 and fast for the others if not given."""
+    """Preset of all runs; paper for figures 5.4 to 5.7 and fast for the others if not given. Not with --quick."""
     quick: bool = False
-    """For a CPU: preset cpu, seed 0, VisualFetchReach. 5.4 to 5.7 take only a few steps, as a demonstration without
+    """For a CPU: preset cpu, one seed, VisualFetchReach. 5.4 to 5.7 take only a few steps, as a demonstration without
     learning."""
     tasks: tuple[str, ...] = ()
     """Only these environments; all of the figure's, or VisualFetchReach with --quick, if not given."""

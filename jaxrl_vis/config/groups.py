@@ -253,8 +253,7 @@ class StudyOptions:
     """Mean age of sampled transitions, in transitions: older ones are sampled less often, as if new episodes replaced random
     ones. None: uniform sampling."""
     n_step: Annotated[Count, NEEDS_STATES] = 1
-    """Number of rewards summed in a target before it bootstraps. More than 1 needs true states and a method without a
-    filter."""
+    """Number of rewards summed in a target before it bootstraps. More than 1 needs method oracle, and excludes aux_tasks."""
     reward_noise: Annotated[NotNegative, NEEDS_STATES] = 0.0
     """Standard deviation of the noise on the state from which the oracle's reward is computed, in the unit of the state."""
     reward_false_positives: Annotated[Fraction, NEEDS_STATES, FALSE_REWARD] = 0.0

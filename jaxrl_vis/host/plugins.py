@@ -52,7 +52,7 @@ def find(kind: str, name: str, known: Mapping[str, T], folder: str | None = None
 
 
 def load(name: str, folder: str | None = None) -> tuple[ModuleType, str]:
-    """Import the module of ``module:Name``, and return it with the second half of the name.
+    """Import the module of ``module:Name``; return it and ``Name``.
 
     Raises:
         RequestError: ``name`` does not have this form, or the module cannot be imported.

@@ -4,6 +4,8 @@
     update          all gradient steps of an iteration, on batches sampled from the replay
     policy_params   the part of an agent needed for acting: small, and sufficient for a policy
     act             actions without exploration
+    aim             representation of the goals that ``act`` takes, computed once per episode
+    diagnose        further metrics of a rollout
 
 An algorithm is built by a function of a `Setup`, which holds the configuration and the sizes of the task. DDPG, TD3 and
 contrastive RL are built in (`train_step.ALGORITHMS`); ``--algorithm module:Name`` selects a custom one. `networks.policy`

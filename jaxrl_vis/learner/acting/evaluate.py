@@ -21,8 +21,9 @@ class Evaluation(NamedTuple):
     Attributes:
         metrics: [S] float32 by name, over all episodes: means of `GoalEnv.metric_names`, each prefixed by ``eval/``, and
             ``eval/goal_distance_median``.
-        recording: ``frames`` [S, K, T+1, ...], ``goals`` [S, K, ...] and ``success`` [S, K] of the first K episodes of one
-            shard of each seed (`num_recorded`), without older stacked images; D * K episodes once D shards are assembled.
+        recording: ``frames`` [S, K, T+1, ...] and ``goals`` [S, K, ...] in the dtype of observations, without older stacked
+            images, and ``success`` [S, K] float32, of the first K episodes of one shard of each seed (`num_recorded`); D * K
+            episodes once D shards are assembled.
     """
 
     metrics: Metrics

@@ -106,7 +106,8 @@ class Rollout(NamedTuple):
     Attributes:
         episodes: [S, K, ...] kept episodes.
         outcome: [S, E] by name, metrics (`GoalEnv.metric_names`) of all episodes at their last step.
-        record: [S, K, T+1, ...] results of ``record`` for the kept episodes' states after 0, 1, ..., T steps; or None.
+        record: [S, K, T+1, ...] results of ``record`` for the kept episodes' states after 0, 1, ..., T steps; None without
+            this function.
     """
 
     episodes: Episodes

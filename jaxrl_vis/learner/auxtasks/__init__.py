@@ -4,7 +4,7 @@
     inverse_dynamics   latent, next latent  -> action
     egomotion          latent, latent of the image rotated -> angle
     autoencoder        latent               -> image
-    optical_flow       latent, next latent  -> strength of the optical flow
+    optical_flow       latent, next latent  -> magnitude of the optical flow
 
 Each is a separate file with a function ``make`` of a `Spec`. An `AuxTask` declares its inputs; the learner encodes, stores and
 samples what the tasks of a run declare, without referring to any task by name.

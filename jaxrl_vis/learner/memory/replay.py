@@ -55,8 +55,8 @@ class Indices(NamedTuple):
     """Positions of B transitions: [B] int32 each.
 
     Attributes:
-        episode: In [0, N).
-        time: t in [0, T).
+        episode: Position of the episode in the replay, in [0, N).
+        time: t, number of the transition's first step, in [0, T).
     """
 
     episode: jax.Array

@@ -38,9 +38,9 @@ class Choice(NamedTuple):
         indices: Positions of the transitions, [B] each.
         goal_slot: [B] int32 in [t + 1, T + 1]; for goals from another episode, in [1, T].
         goal_episode: [B] int32, episodes of the goal slots; None for the transitions' own episodes.
-        shift: [B, 2] int32, see `Batch`; or None.
-        target_key: [] typed key, for targets of auxiliary tasks; or None.
-        clutter_end: [] float32, see `reward_errors`; or None.
+        shift: [B, 2] int32, see `Batch`; None without random shifts.
+        target_key: [] typed key, for targets of auxiliary tasks; None without any.
+        clutter_end: [] float32, see `reward_errors`; None if false rewards are not confined.
         is_replaceable: [B] bool, mask of relabelled goals to be replaced by another transition's if they are already reached;
             None if none is, or if true states have decided that (``goal_episode``).
     """

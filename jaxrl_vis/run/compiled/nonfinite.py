@@ -19,7 +19,7 @@ def _floating_leaves(tree: Any) -> dict[str, Any]:
 
 
 def nonfinite_leaves(loop: LoopState) -> dict[str, jax.Array]:
-    """Return for each floating-point leaf, by name, whether it has a NaN or an infinity, [] bool. Traceable under jit."""
+    """Return, by name of each floating-point leaf, True if it has a NaN or an infinity: [] bool. Traceable under jit."""
     return {name: ~jnp.isfinite(leaf).all() for name, leaf in _floating_leaves(loop).items()}
 
 

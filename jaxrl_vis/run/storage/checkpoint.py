@@ -136,7 +136,7 @@ class Checkpoints:
         return self.run_id in (ANY_RUN, manifest.get(RUN_ID))
 
     def newest(self) -> int | None:
-        """Return the newest iteration from which the run could resume; None if there is none."""
+        """Return the iteration of the newest full, recent or light checkpoint, even if damaged; None if there is none."""
         return max((iteration for tier in _PRECEDENCE for iteration in self.iterations(tier)), default=None)
 
     def save_light(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
@@ -329,7 +329,10 @@ class Checkpoints:
         return self._newest_good(template, with_replay=True)
 
     def restore_train(self, template: LoopState, iteration: int | None = None) -> Restored | None:
-        """Restore the learner of the newest valid light or full checkpoint, or of ``iteration``; see `restore_for_resume`."""
+        """Restore the learner of the newest valid light or full checkpoint, or of that of ``iteration``; None without one.
+
+        Otherwise as `restore_for_resume`.
+        """
         return self._newest_good(template, with_replay=False, requested=iteration)
 
     def manifest(self, tier: str, iteration: int) -> dict[str, Any]:
@@ -342,7 +345,7 @@ class Checkpoints:
             return self._read_manifest(tier, iteration)
 
     def restore(self, tier: str, manifest: dict[str, Any], template: LoopState) -> Restored:
-        """Restore one checkpoint completely, and compare it with the checksums in its manifest.
+        """Restore a light, best or full checkpoint completely, and compare it with the checksums in its manifest.
 
         Raises:
             RequestError: The checkpoint is damaged, or has another structure.

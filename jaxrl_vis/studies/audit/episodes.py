@@ -118,7 +118,8 @@ def with_noise(pairs: Pairs, deviation: float, seed: int) -> Pairs:
 def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:
     """Pair every image but the first with the last image of its episode, that of another episode, and the given goal.
 
-    The 3 E T pairs are in this order of goals; for each of them, episode by episode. ``seed`` determines the other episodes.
+    The 3 E T pairs are in this order of goals; for each of them, episode by episode. ``seed`` determines the other
+    episodes. If there is only one episode, it is also the other one.
     """
     count, length = episodes.images.shape[0], env.horizon
     draw = np.random.default_rng(seed)
