@@ -94,7 +94,7 @@ class Algorithm(NamedTuple):
     networks: Any = None
 
     def of_policies(self, statistics: Statistics) -> "Algorithm":
-        """Return the algorithm for agents that consist of policy parameters only: they can act, but not learn.
+        """Return the algorithm for agents that consist of policy parameters only: they can act, but ``update`` raises an error.
 
         Args:
             statistics: Initial observation statistics.

@@ -174,7 +174,13 @@ def forward(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
 
 
 def random_poses(mj_model: mujoco.MjModel, count: int, seed: int, spread: float = 1.0) -> dict[str, np.ndarray]:
-    """Compute poses in world coordinates for ``count`` random joint positions, see `scatter_joints`.
+    """Compute poses in world coordinates for ``count`` random joint positions.
+
+    Args:
+        mj_model: Model.
+        count: Number of poses.
+        seed: Seed of the joint positions.
+        spread: See `scatter_joints`.
 
     Returns:
         Arrays [count, ...] float32 by name (`POSES`), shaped as in MjData.

@@ -297,7 +297,13 @@ class Networks:
         return jnp.clip((observations.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
 
     def encode(self, params: Params, inputs: jax.Array, which: slice = slice(None)) -> jax.Array:
-        """Encode the prepared observations ``which``: [B, latent]; a state vector is its own latent."""
+        """Encode prepared observations: [B, latent]; a state vector is its own latent.
+
+        Args:
+            params: Parameters of the actor or critic; only ``encoder`` is read.
+            inputs: Observations from `prepare`.
+            which: Slice of their first axis that is encoded, of length B.
+        """
         return self.encode_pieces(params, [(inputs, which)])
 
     def encode_pieces(self, params: Params, pieces: Sequence[Piece]) -> jax.Array:

@@ -77,7 +77,7 @@ def _actions(key: jax.Array, horizon: int, size: int) -> jax.Array:
 
 
 def play(env: GoalEnv, count: int, seed: int) -> Episodes:
-    """Roll out E = ``count`` episodes of slowly changing random actions; return NumPy arrays."""
+    """Roll out E = ``count`` episodes of slowly changing random actions, determined by ``seed``; return NumPy arrays."""
 
     def episode(key: jax.Array) -> Episodes:
         start_key, action_key = jax.random.split(key)

@@ -43,7 +43,10 @@ Start = Callable[[Sequence[str], Path, Mapping[str, str]], subprocess.Popen | Jo
 
 
 def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> subprocess.Popen:
-    """Start a command on this machine, appending its output to ``log``. See `cluster` for other machines."""
+    """Start a command on this machine with the variables of ``environment`` added, appending its output to ``log``.
+
+    See `cluster` for other machines.
+    """
     # In its own session, so that a Ctrl-C of the terminal reaches it only once, from here: a second signal would end it at
     # once.
     with log.open("a", encoding="utf-8") as file:

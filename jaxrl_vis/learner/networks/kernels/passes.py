@@ -94,7 +94,10 @@ def dot(left: jax.Array, right: jax.Array, contract: tuple[int, int] = (1, 0)) -
 
 
 def layer(values: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
-    """Apply a dense layer with rectifier: [R, inputs] -> [R, outputs], in the dtype of ``values``."""
+    """Apply a dense layer with rectifier: [R, inputs] -> [R, outputs], in the dtype of ``values``.
+
+    ``kernel`` is [inputs, outputs], ``bias`` [outputs].
+    """
     return relu(dot(values, kernel) + bias[None, :]).astype(values.dtype)
 
 
