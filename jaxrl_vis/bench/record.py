@@ -102,7 +102,7 @@ def write_json(path: Path, records: list[dict[str, Any]]) -> None:
 
 
 def keep(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
-    """Store a record in a file; return the record of the same configuration and device that it replaces, if any."""
+    """Store a record in a file; return the record of the same configuration and device that it replaces; None without one."""
     record = json.loads(json.dumps(record))  # as it will be read back: tuples become lists
     records = load(path)
     previous = next((old for old in records if _key(old) == _key(record)), None)

@@ -85,7 +85,7 @@ def check_run(run: Path) -> Path:
 
 
 def read_checkpoint(word: str | None) -> int | Literal["best"] | None:
-    """Read ``--checkpoint``: an iteration, ``best``, or nothing.
+    """Read ``--checkpoint``: an iteration, ``best``, or None if it is not given.
 
     Raises:
         RequestError: It is none of these.

@@ -179,7 +179,7 @@ class TrainStep:
 
 
 def _object_mask(env: GoalEnv, config: Config, resolved: Resolved) -> Callable[[jax.Array], jax.Array] | None:
-    """Return the function that reads the object's mask from images, if the environment marks one, for indicators.
+    """Return the function that reads the object's mask from images, for indicators; None if the environment marks no object.
 
     Raises:
         RequestError: No reward reads the mask, or noise hides it.

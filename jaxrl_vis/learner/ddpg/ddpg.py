@@ -300,7 +300,8 @@ def make_update(
             """Take gradient steps, of which only the last updates the actor; unrolled, so that the body has no conditional.
 
             Each step receives its prepared batch, and prepares the next one, which a GPU can do while it computes; otherwise,
-            it would have to wait for its own batch first.
+            it would have to wait for its own batch first. Returns the new state, and the means of the metrics, stacked in the
+            order of ``names``.
             """
             (working, prepared), rows = state, []
             for number in range(interval):

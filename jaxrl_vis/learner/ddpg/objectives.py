@@ -94,7 +94,7 @@ _MAIN_READS, _OTHERS_READ = "main", "others"
 
 
 def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[str, Callable[[Params], jax.Array]]:
-    """Return functions from encoder parameters to the latents of the main loss, and to those of auxiliary losses.
+    """Return functions from encoder parameters to the latents [observations, B, latent] of the main loss and of the others.
 
     Only the main loss reads goals, so separate encodings shorten the backward passes of auxiliary losses.
     """

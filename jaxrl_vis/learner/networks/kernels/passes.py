@@ -121,7 +121,7 @@ def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
 
 
 def layer_inputs(values: jax.Array, level: int) -> jax.Array:
-    """Return the rows that layer ``level`` multiplies: four quarters side by side for the last of them, else unchanged."""
+    """Return the rows that layer ``level`` multiplies: for the last layer [4 R, F] -> [R, 4 F], else unchanged."""
     return values.reshape(values.shape[0] // 4, -1) if level == LEVELS - 1 else values
 
 
