@@ -28,7 +28,7 @@ def run(benchmark: str, results: Path | None = None, json: Path | None = None, *
     Args:
         benchmark: One of `BENCHMARKS`.
         results: Folder of stored records; None for the user's cache, see `record.user_folder`.
-        json: Additional file for the records of this run.
+        json: Additional file for the records of this run; None for no such file.
         **settings: Fields of `Settings`.
 
     Raises:

@@ -35,7 +35,7 @@ def find(kind: str, name: str, known: Mapping[str, T], folder: str | None = None
         kind: Kind of the component, for messages.
         name: A key of ``known``, or ``module:Name``.
         known: Built-in components by name.
-        folder: Folder from which modules are imported first.
+        folder: Folder from which modules are imported first; None to begin with the current folder.
 
     Raises:
         RequestError: There is no such component, or its module cannot be imported.
@@ -52,7 +52,7 @@ def find(kind: str, name: str, known: Mapping[str, T], folder: str | None = None
 
 
 def load(name: str, folder: str | None = None) -> tuple[ModuleType, str]:
-    """Import the module of ``module:Name``; return it and ``Name``.
+    """Import the module of ``module:Name``; return it and ``Name``. For ``folder`` see `find`.
 
     Raises:
         RequestError: ``name`` does not have this form, or the module cannot be imported.

@@ -141,7 +141,8 @@ def play(
         num_envs: E, number of environments per learner in this call.
         exploration: Exploration noise.
         num_kept: K, number of episodes to keep (the first ones); None for all.
-        record: Function of the state of one environment that returns a pytree to record, after reset and after each step.
+        record: Function of the state of one environment that returns a pytree to record, after reset and after each step; None
+            to record nothing.
         draws: Source of random numbers for these environments.
     """
     env, algorithm, deviation, observe_state = acting

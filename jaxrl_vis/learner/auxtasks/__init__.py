@@ -37,7 +37,7 @@ def make(names: Sequence[str], spec: Spec, folder: str | None = None) -> dict[st
     Args:
         names: Names out of `NAMES`, or ``module:Name`` of functions of a `Spec` that return an `AuxTask`; may be empty.
         spec: Sizes of the observation, the action and the latent.
-        folder: Folder from which modules are imported first.
+        folder: Folder from which modules are imported first; None to begin with the current folder.
 
     Raises:
         RequestError: A name is unknown or occurs twice, a function does not return an `AuxTask`, two tasks have the same

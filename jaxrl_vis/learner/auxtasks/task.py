@@ -123,9 +123,10 @@ class AuxTask(NamedTuple):
         loss: (parameters, View) -> [] float32, such as the mean squared error of that prediction.
         needs: Optional fields of `View` that it reads, out of ``latent_tp1`` and ``image``.
         episode: [T + 1, C, H, W] uint8, images of an episode -> [T, ...] uint8 or float32. Computed once, when an episode is
-            collected, because a transition is usually sampled several times.
+            collected, because a transition is usually sampled several times. None if nothing is stored.
         view: (key, Transitions) -> (images [B, C, H, W] uint8 to be encoded, target). The images are shifted like the batch.
-        target: Transitions -> target, for tasks without ``view``.
+            None if the task has no images of its own.
+        target: Transitions -> target, for tasks without ``view``; None if the loss needs no target.
         shift: (target, [B, 2] int32 pixels) -> target for images shifted by this down and to the right; None if the target does
             not change.
         number: Integer (uint32) folded into the task's random keys, so that its samples do not depend on the other tasks; None

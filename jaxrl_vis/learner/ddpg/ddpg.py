@@ -122,7 +122,7 @@ def _network_parameters(state: Agent) -> tuple[Params, ...]:
 
 
 def _start(networks: Networks, auxiliary: Auxiliary, learned_reward: LearnedReward | None, key: jax.Array) -> Agent:
-    """Initialise an agent; its target networks equal the online networks."""
+    """Initialise an agent; its target networks equal the online networks. ``learned_reward`` is None without a reward model."""
     actor_key, critic_key = jax.random.split(key)
     actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
     target_actor, target_critic = networks.init_target(actor), networks.init_target(critic)

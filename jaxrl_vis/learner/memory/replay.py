@@ -99,7 +99,8 @@ class Replay(NamedTuple):
             observation: Shape and dtype of one observation (`GoalEnv.observation_spec`).
             goal_state_size: G.
             action_size: A.
-            stored: Shapes and dtypes of the arrays stored with one episode, by auxiliary task (`Auxiliary.stored_spec`).
+            stored: Shapes and dtypes of the arrays stored with one episode, by auxiliary task (`Auxiliary.stored_spec`); None
+                for no such arrays.
             full_state_size: P - G, size of `Episodes.full_states`; 0 if they are not stored.
         """
         episodes, horizon = self.num_episodes, self.horizon
