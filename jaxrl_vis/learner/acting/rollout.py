@@ -27,8 +27,8 @@ class Exploration(NamedTuple):
     """Exploration noise of actions; none by default.
 
     Attributes:
-        random_action_probability: Probability that an action vector is replaced by a uniformly sampled one.
-        action_noise: Standard deviation of the Gaussian noise on the others.
+        random_action_probability: Probability that an action vector is replaced by a uniformly sampled one; float or [].
+        action_noise: Standard deviation of the Gaussian noise on the others; float or [].
     """
 
     random_action_probability: float | jax.Array = 0.0

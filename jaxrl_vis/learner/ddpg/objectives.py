@@ -294,7 +294,7 @@ class Objectives:
             actor, critic: Parameters; those of the critic are held constant.
             inputs, image, batch: As in `critic_gradient`.
             critic_latents: Latents of the critic's encoder, which an actor without an encoder reads, too.
-            weights: Weights of the critic's losses in this step.
+            weights: Weights of the critic's losses in this step, with `MAIN`.
         """
         has_encoder = not self.networks.shares_encoder
         latents, others = critic_latents, {}
