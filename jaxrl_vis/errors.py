@@ -12,12 +12,14 @@ class RequestError(ValueError):
 
 
 class NonFiniteError(FloatingPointError):
-    """Non-finite loss, state or parameter. One line: which one, where the state was dumped, and what is still usable."""
+    """Non-finite loss, state or parameter. The message is one line: which numbers, where the state was dumped, and the last
+    checkpoint. The command line exits with 4.
+    """
 
 
 class StorageError(RuntimeError):
-    """Failure to write a run's files, for example because the disk is full. One line: the cause, what was saved, and the
-    remedy.
+    """Failure to write files, for example because the disk is full. The message is one line: the cause and, for a run, what was
+    saved and how to resume. The command line exits with 1.
     """
 
 
@@ -35,4 +37,4 @@ class Terminated(SystemExit):
 
 
 class WorkerError(RuntimeError):
-    """Worker process killed externally. One line: the cause and the remedy. The command line exits with 1."""
+    """Worker process killed externally. The message is one line: the cause and the remedy. The command line exits with 1."""

@@ -2,7 +2,7 @@
 
     E  environments in a rollout          B  transitions in a batch       C, H, W  channels, height, width of an image
     N  episodes that the replay holds     A  action components            G        components of the true goal state
-    T  control steps of an episode        S  seeds trained in parallel    P        G, and components of the task's true state
+    T  control steps of an episode        S  seeds trained in parallel    P        G plus components of ``full_states``
 
 An observation is a planar image [C, H, W] uint8 or a state vector [S] float32; "..." stands for its own axes.
 """
@@ -51,8 +51,8 @@ class Episodes(Replaceable):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ReplayState(Replaceable):
-    """Ring buffer of N episodes. The arrays are those of `Episodes` with E = N, except that images are packed and stored once
-    (`replay`).
+    """Ring buffer of N episodes. The arrays are those of `Episodes` with E = N, except that images are packed, and each image
+    of a stack is stored once (`replay`).
 
     Attributes:
         episodes: [N, ...] storage; unwritten entries are zero.
@@ -74,8 +74,8 @@ class Batch(Replaceable):
         action: [B, A] float32.
         state_tp1: [B, G] float32, the true state after the action.
         goal_state: [B, G] float32, the true state depicted by the goal.
-        reward: [B] float32 for reaching that goal, summed over the steps between the first and the last observation; None until
-            it is computed, and if the learner itself computes it (methods autoencoder and classifier).
+        reward: [B] float32 for reaching that goal, the discounted sum over the steps between the first and the last
+            observation; None until it is computed, and if the learner itself computes it (methods autoencoder and classifier).
         discount: [B] float32, discount factor of the value after these steps; None for that of a single step.
         shift: [B, 2] int32, pixels by which to shift the images down and to the right; None for no shift.
         views: [B, ...] images in the observation's dtype, computed by auxiliary tasks, by task (`AuxTask.view`).

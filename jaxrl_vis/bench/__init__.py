@@ -2,9 +2,9 @@
 
     settings -> render | physics | env | update | train -> Measurement -> record
 
-Every benchmark varies the state of each environment, asserts that the results differ, warms up, waits for the device, repeats,
-and reports the median; compilation is timed separately. `conditions` decides which figures are comparable, and `record` stores
-them and prints each change. `scenes` measures the renderer on scenes that other renderers draw as well.
+States of environments, images and episodes of the replay differ, which is asserted. Every benchmark warms up, waits for the
+device, repeats, and reports the median; compilation is timed separately. `conditions` decides which figures are comparable, and
+`record` stores them and prints each change. `scenes` measures the renderer on scenes that other renderers draw as well.
 
 The other renderers and learners (`benchmarks.peers`) and the tables that are written from records (`benchmarks.ledger`) are
 not part of the package: they run from a checkout.
@@ -28,7 +28,7 @@ def run(benchmark: str, results: Path | None = None, json: Path | None = None, *
     Args:
         benchmark: One of `BENCHMARKS`.
         results: Folder of stored records; None for the user's cache, see `record.user_folder`.
-        json: Additional file for the records of this run.
+        json: Additional file for the records of this run; None for no such file.
         **settings: Fields of `Settings`.
 
     Raises:

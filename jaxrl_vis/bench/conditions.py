@@ -24,7 +24,7 @@ from jaxrl_vis_envs.cores import num_cores
 SAME_SPEED = 0.1
 """Maximum relative difference between two calibrations that count as the same speed."""
 BUSY_CORES = 0.3
-"""Maximum fraction of the available cores that other programs may use."""
+"""Maximum fraction of the available cores that other programs may use during comparable measurements."""
 
 _SAMPLE_S, _CALIBRATION_S, _REPEATS = 0.4, 0.04, 5
 
@@ -64,7 +64,9 @@ def _busy_seconds() -> float | None:
 
 
 def calibrate() -> dict[str, float]:
-    """Measure the device on two fixed workloads: matrix products (GFLOP/s) and the addition of long arrays (GB/s)."""
+    """Measure the device's speed on two fixed workloads, by name: matrix products (``gflops``) and the addition of long arrays
+    (``gbytes_per_s``), in 1e9 operations or bytes per second.
+    """
     return {name: round(work.amount / _seconds(work), 2) for name, work in calibrations().items()}
 
 
@@ -121,7 +123,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 class ConditionMonitor:
-    """Monitor of the machine during a benchmark: ask for the conditions after each measurement."""
+    """Monitor of the machine during a benchmark; call `conditions` after each measurement."""
 
     def __init__(self) -> None:
         self._busy_cores, self._calibration = busy_cores(), calibrate()

@@ -17,7 +17,16 @@ ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
 
 
 def time_episodes(env: GoalEnv, count: int, repeats: int) -> tuple[Timing, float]:
-    """Time one episode in each of ``count`` environments; return the timing and the seconds of compilation."""
+    """Time one episode in each of ``count`` environments; return the timing and the seconds of compilation.
+
+    Args:
+        env: Environment, stepped with random actions.
+        count: Number of environments.
+        repeats: Maximum number of timed episodes, see `timing.measure`.
+
+    Raises:
+        AssertionError: The last frames or the goals are mostly copies (`assert_varied`).
+    """
 
     def episode(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         reset_key, action_key = jax.random.split(key)

@@ -57,7 +57,7 @@ def user_folder() -> Path:
 
 
 def results_path(benchmark: str, folder: Path | None = None) -> Path:
-    """Return the path of the file for one benchmark on this device."""
+    """Return the path of the file for one benchmark on this device, in ``folder`` or, if that is None, in `user_folder`."""
     slug = re.sub(r"[^a-z0-9]+", "-", provenance.device_name().lower().replace("(r)", "").replace("(tm)", "")).strip("-")
     return (folder or user_folder()) / f"{benchmark}-{slug}.json"
 
@@ -102,7 +102,7 @@ def write_json(path: Path, records: list[dict[str, Any]]) -> None:
 
 
 def keep(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
-    """Store a record in a file; return the record of the same configuration and device that it replaces, if any."""
+    """Store a record in a file; return the record of the same configuration and device that it replaces; None without one."""
     record = json.loads(json.dumps(record))  # as it will be read back: tuples become lists
     records = load(path)
     previous = next((old for old in records if _key(old) == _key(record)), None)
@@ -112,7 +112,10 @@ def keep(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def describe(record: dict[str, Any], previous: dict[str, Any] | None) -> str:
-    """Describe a record in one line: quantity, configuration, value, and its change if the two are comparable."""
+    """Describe a record in one line: quantity, configuration, value, and its change if the two are comparable.
+
+    ``previous`` is the record that it replaces; None if there is none.
+    """
     config = " ".join(f"{name}={value}" for name, value in record["config"].items())
     line = f"{record['name']:24} {config:72} {format_figure(record['value']):>12} {record['unit']}"
     if previous is None:

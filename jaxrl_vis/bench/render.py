@@ -31,7 +31,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
     """Yield images per second for each size, output and batch: of the scene if one is set, else of the environment.
 
     Raises:
-        RequestError: The environment does not observe images, or as in `scenes.models.load`.
+        RequestError: The environment does not observe images; for a scene, see `scenes.models.load`.
     """
     if settings.scene is not None:
         yield from scene_images.measure(settings, image_sizes(settings))
@@ -68,7 +68,7 @@ def image_sizes(settings: Settings) -> tuple[int, ...]:
 
 
 def random_states(settings: Settings, count: int, seed: int = 4) -> Any:
-    """Create states of ``count`` environments after five random control steps, without images."""
+    """Create states of ``count`` environments after five random control steps, without images; ``seed`` is of the actions."""
     env = settings.make_env()
 
     def scatter(state: Any, key: jax.Array) -> Any:

@@ -16,7 +16,12 @@ from jaxrl_vis.learner.networks.networks import Networks
 
 @dataclasses.dataclass(frozen=True)
 class Cost:
-    """Floating-point operations and bytes of memory traffic of one gradient step."""
+    """Cost of one gradient step.
+
+    Attributes:
+        flops: Floating-point operations; a multiply-add counts as two.
+        bytes: Memory traffic in bytes; NaN if unknown.
+    """
 
     flops: float
     bytes: float
@@ -99,7 +104,14 @@ def _bytes(tree: Any) -> int:
 
 
 def describe(cost: Cost, seconds: float, dtype: str, device_kind: str) -> dict[str, Any]:
-    """Return operations, memory traffic and the achieved TFLOP/s and GB/s, with fractions of the device's peak if known."""
+    """Return operations, memory traffic and the achieved TFLOP/s and GB/s, with fractions of the device's peak if known.
+
+    Args:
+        cost: Cost of a gradient step.
+        seconds: Duration of a gradient step in seconds.
+        dtype: Compute dtype of the networks, bfloat16 or float32, which selects the peak.
+        device_kind: Kind of the device, as in `device_peak`.
+    """
     achieved = {
         "gflop": round(cost.flops / 1e9, 3),
         "mbyte": round(cost.bytes / 1e6, 3),

@@ -13,13 +13,13 @@ from jaxrl_vis_envs import registry
 class Settings:
     """Settings of a benchmark.
 
-    If None or empty, ``envs``, ``image_size`` and ``pixels`` depend on the device, and ``preset``, ``batch_size`` and
-    ``data_devices`` are the defaults of the benchmark.
+    If None or empty, ``image_size`` and ``pixels`` depend on the device, ``envs`` on the device and the benchmark, and
+    ``preset``, ``batch_size`` and ``data_devices`` are the defaults of the benchmark.
 
     Attributes:
         env: Name of the environment.
         preset: Preset of the networks and gradient steps.
-        envs: Batch sizes in environments (or images), with one measurement for each.
+        envs: Batch sizes in environments (or images), with one measurement for each; unused by the benchmark update.
         image_size: Height and width of images.
         pixels: Channels: rgbd, rgb or depth.
         batch_size: Number of transitions per gradient step.

@@ -120,7 +120,13 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
 
 
 def describe(iteration: float, part_seconds: dict[str, float], predicted: float) -> str:
-    """Format a table of the parts of an iteration: milliseconds, and percent of an iteration."""
+    """Format a table of the parts of an iteration: milliseconds, and percent of an iteration.
+
+    Args:
+        iteration: Duration of an iteration in seconds.
+        part_seconds: Results of `time_parts`, and ``host``.
+        predicted: Predicted duration of an iteration in seconds.
+    """
     total = part_seconds["rollout"] + part_seconds["insert"] + part_seconds["updates"] + part_seconds["host"]
     rows = {**part_seconds, "sum without evaluation": total, "iteration": iteration, "predicted": predicted}
     lines = [f"    {name:24}{1e3 * seconds:12,.2f} ms {seconds / iteration:8.1%}" for name, seconds in rows.items()]

@@ -66,6 +66,11 @@ def init_with_full_replay(program: TrainStep) -> LoopState:
 def time_updates(program: TrainStep, loop: LoopState, repeats: int) -> tuple[Timing, float]:
     """Time one call of ``update_many``, which donates ``loop.train``; return the timing and the seconds of compilation.
 
+    Args:
+        program: Programs of the run.
+        loop: State with a full replay.
+        repeats: Maximum number of timed calls, see `timing.measure`.
+
     Raises:
         AssertionError: The parameters of the actor did not change.
     """

@@ -29,7 +29,7 @@ class Audit(TaskImages):
     sequences: int = 64
     """Number of action sequences that it tries per goal."""
     noise: float = 0.0
-    """Standard deviation of camera noise, grey levels."""
+    """Standard deviation of the camera noise on images and goals, grey levels; the search has none."""
     tolerance: float = 8.0
     """Maximum difference of equal elements for indicator_tolerance, grey levels."""
     tolerance_share: float = 0.99

@@ -24,23 +24,25 @@ class Bench:
     benchmark: Annotated[Benchmark | None, tyro.conf.Positional] = None
     """Quantity to measure: images, physics, both with resets, gradient steps, or whole training iterations."""
     env: Annotated[str, AlsoPositional()] = "VisualFetchReach"
-    """Environment; module:Name for a custom one."""
+    """Environment; module:Name for a custom one; unused with --scene."""
     preset: Literal["paper", "fast", "cpu", "debug"] | None = None
     """Preset of the networks and gradient steps (update, train); fast on accelerators and cpu on a CPU if not given."""
     envs: tuple[int, ...] = ()
-    """Batch sizes in environments (or images), with one measurement for each (except update); sizes suitable for the device if
-    not given."""
+    """Batch sizes in environments (or images), one measurement each (not used by update). If not given: sizes suitable for the
+    device; for train, the preset's."""
     image_size: int | None = None
-    """Height and width of images; 64 on accelerators and 32 on a CPU if not given. render measures 64 and 100, or 32 and 64,
-    unless this is a different one."""
+    """Height and width of images (not used by physics); 64 on accelerators and 32 on a CPU if not given. render measures 64
+    and 100, or 32 and 64, unless this is a different one."""
     pixels: Pixels | None = None
-    """Channels; rgbd on accelerators and depth on a CPU if not given. render measures several."""
+    """Channels of images (env, update, train); rgbd on accelerators and depth on a CPU if not given. render measures several
+    instead."""
     batch_size: int | None = None
     """Transitions in a gradient step (update, train); the preset's if not given."""
     seeds: int = 1
     """Learners in one program (update, train)."""
     devices: str | None = None
-    """Number of devices, or all; one device with its fraction of the work is also measured (train)."""
+    """Number of devices, or all; one if not given. With several, one device with its fraction of the work is also measured
+    (train)."""
     data_devices: int | None = None
     """Number of devices that share each learner; all of them if there is one seed, else one (train)."""
     repeats: int = 5

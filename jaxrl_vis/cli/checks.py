@@ -19,7 +19,7 @@ def check_env(name: str, folder: str | None = None) -> None:
 
     Args:
         name: Name of the environment.
-        folder: Folder in which the module of ``module:Name`` was found earlier.
+        folder: Folder in which the module of ``module:Name`` was found earlier; None if unknown.
 
     Raises:
         RequestError: It does not exist, or its module cannot be imported.
@@ -85,7 +85,7 @@ def check_run(run: Path) -> Path:
 
 
 def read_checkpoint(word: str | None) -> int | Literal["best"] | None:
-    """Read ``--checkpoint``: an iteration, ``best``, or nothing.
+    """Read ``--checkpoint``: an iteration, ``best``, or None if it is not given.
 
     Raises:
         RequestError: It is none of these.

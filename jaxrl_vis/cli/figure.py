@@ -41,18 +41,18 @@ class Figure:
     """A .png, .pdf or .svg file; figure_FIGURE.png (or quadratic.png, pareto.png) in the current folder if not given. Tables of
     training runs are written beside it, as .md and .csv."""
     preset: str | None = None
-    """Preset of all runs; paper for figures 5.4 to 5.7 and fast for the others if not given."""
+    """Preset of all runs; paper for figures 5.4 to 5.7 and fast for the others if not given. Not with --quick."""
     quick: bool = False
-    """For a CPU: preset cpu, seed 0, VisualFetchReach. 5.4 to 5.7 take only a few steps, as a demonstration without
+    """For a CPU: preset cpu, one seed, VisualFetchReach. 5.4 to 5.7 take only a few steps, as a demonstration without
     learning."""
     tasks: tuple[str, ...] = ()
-    """Only these environments; all of the figure's if not given."""
+    """Only these environments; all of the figure's, or VisualFetchReach with --quick, if not given."""
     methods: tuple[str, ...] = ()
     """Methods to be compared instead of the figure's own, such as none sum fixed_0.1 ol_aux_5."""
     seed: int | None = None
     """First seed; 0 if not given."""
     seeds: int | None = None
-    """Number of seeds; 5 if not given."""
+    """Number of seeds; 5, or 1 with --quick, if not given."""
     seeds_per_run: int | None = None
     """Maximum number of seeds per program, to save memory; all of them if not given."""
     env_steps: int | None = None
@@ -60,7 +60,8 @@ class Figure:
     env_options: tuple[str, ...] = ()
     """Settings of the environment in every run, as in `train`: view=fingertips tip_marks=faint."""
     runs: Path | None = None
-    """Folder of all run folders and logs, shared by figures on one subject; runs/ol_aux or runs/indicator if not given."""
+    """Folder of all run folders and logs, shared by figures on one subject; runs/ol_aux, runs/indicator or runs/goals if not
+    given."""
     minutes: float | None = None
     """Time limit in minutes: runs are saved, finished ones are drawn, and the next start resumes."""
     per_device: int = 1

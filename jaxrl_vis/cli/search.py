@@ -26,7 +26,7 @@ class Search:
     env: Annotated[str, AlsoPositional()] = "VisualFetchReach"
     """Environment: a name listed by `jaxrl-vis envs`, or module:Name for a custom one."""
     vary: tuple[str, ...] = ()
-    """Search space of the options: NAME=LOW..HIGH, NAME=LOW..HIGH,log or NAME=VALUE,VALUE,..., such as
+    """Search space of one or several options: NAME=LOW..HIGH, NAME=LOW..HIGH,log or NAME=VALUE,VALUE,..., such as
     actor_learning_rate=1e-4..1e-2,log batch_size=128,256."""
     trials: int = 20
     """Number of trials, including those of earlier starts."""

@@ -55,7 +55,7 @@ class Train:
     changes: Annotated[Mapping[str, Any], FieldsOf(Config, describe_default)] = dataclasses.field(default_factory=dict)
     devices: str | None = None
     """Number of devices, or all (docs/scaling.md), over which seeds are distributed or, with a single seed, batches and
-    environments; one if not given."""
+    environments; if not given, one, or all with several processes."""
     run_dir: Path | None = None
     """Folder for metrics, images and checkpoints; a new one under runs/ if not given."""
     show_config: bool = False
@@ -73,7 +73,7 @@ class Train:
     start_timeout: int = distributed.START_S
     """Time limit for the processes to find each other at the start, s."""
     trust: bool = False
-    """With --resume: execute the run's custom code without asking, if its task is module:Name and another user started it."""
+    """With --resume: execute the run's custom code (module:Name) without asking, even if it was not trained here."""
     log: tuple[LoggerName, ...] = ()
     """Also log to TensorBoard or Weights & Biases; with --resume, the run's own loggers if not given."""
 

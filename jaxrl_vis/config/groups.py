@@ -51,7 +51,7 @@ NotNegative = Annotated[float, Bounds(0.0)]
 
 @dataclasses.dataclass(frozen=True)
 class RunOptions:
-    """Seeds, devices and schedule. Counts are per seed; durations are in control steps unless a unit is given."""
+    """Seeds, devices and schedule. Counts of environments, steps, transitions and episodes are per seed."""
 
     preset: Annotated[str, RESUMABLE, UNMEASURED] = "fast"
     """Preset that this configuration was derived from; for the record only."""
@@ -105,9 +105,9 @@ class EnvironmentOptions:
     env_options: tuple[str, ...] = ()
     """Further options of the environment, as name=value; docs/tasks.md lists those that restore a release's behaviour."""
     pixels: Pixels = "rgbd"
-    """Channels of the image."""
+    """Channels of the image; unused by state tasks."""
     image_size: Count = 64
-    """Height and width of the image, in pixels."""
+    """Height and width of the image, in pixels; unused by state tasks."""
     frame_stack: Count | None = None
     """Number of most recent images stacked in an observation. None: the environment's default."""
     randomize: tuple[Randomized, ...] = ()
@@ -146,33 +146,34 @@ class RewardOptions:
     """Source of the rewards (docs/indicator_rewards.md): the true state (oracle), an autoencoder or a success classifier
     trained alongside, a frozen encoder (features), or equality of observations (indicator); module:Name for your own."""
     reward_positive: float | None = None
-    """R+. None: 0 for the oracle, 1 for other methods."""
+    """R+. None: that of the method, 0 for the oracle and 1 for other built-in ones."""
     reward_negative: float | None = None
-    """R-. None: 0 for autoencoder, classifier and features, -1 for other methods."""
+    """R-. None: that of the method, 0 for autoencoder, classifier and features and -1 for other built-in ones."""
     tolerance: Annotated[NotNegative, OfMethod("indicator_tolerance")] = 8.0
-    """Maximum difference of elements that count as equal, in the observation's unit (grey levels for images)."""
+    """Maximum difference of elements that count as equal, in the observation's unit (grey levels for images), for method
+    indicator_tolerance."""
     tolerance_share: Annotated[Fraction, OfMethod("indicator_tolerance")] = 0.99
-    """Fraction of the elements that must be equal."""
+    """Fraction of the elements that must be equal, for method indicator_tolerance."""
     reward_encoder: Annotated[str | None, OfMethod("features")] = None
-    """File with the frozen encoder, from `jaxrl-vis encoder`."""
+    """File with the frozen encoder, from `jaxrl-vis encoder`, for method features."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DDPGOptions:
-    """Losses, targets and exploration of DDPG."""
+    """Losses, targets and exploration. Contrastive RL has no targets, and does not read their options."""
 
     discount: float | None = None
     """gamma. None: 1 - 1/horizon."""
     actor_learning_rate: Positive = 1e-3
     """Adam step size of the actor."""
     critic_learning_rate: Positive = 1e-3
-    """Adam step size of the critic."""
+    """Adam step size of the critic, and of a reward model trained alongside."""
     target_decay: Fraction = 0.99
-    """Decay rate of the target networks: weight of the old target parameters in each target update."""
+    """Decay rate of the target networks (ddpg, td3): weight of the old target parameters in each target update."""
     target_update_interval: Count = 1
-    """Gradient steps between target updates."""
+    """Gradient steps between target updates (ddpg, td3)."""
     actor_interval: Count = 1
-    """Critic gradient steps per actor gradient step; divides updates_per_iteration."""
+    """Critic gradient steps per actor gradient step (ddpg, td3); divides updates_per_iteration."""
     action_penalty: NotNegative = 1.0
     """Weight of the mean squared action in the actor's loss."""
     actor_log: Annotated[Literal["value", "loss"], OfWeighting()] = "value"
@@ -184,7 +185,7 @@ class DDPGOptions:
     policy sees images only. Its own encoder is then that of the auxiliary losses (asymmetric actor-critic, Pinto et al.,
     2018)."""
     clip_targets_above: bool = True
-    """Clip critic targets at R+/(1-gamma) too (they are always clipped at R-/(1-gamma) below)."""
+    """Clip critic targets (ddpg, td3) at R+/(1-gamma) too; they are always clipped at R-/(1-gamma) below."""
     random_action_probability: Fraction = 0.3
     """Exploration: fraction of actions sampled uniformly."""
     action_noise: NotNegative = 0.2
@@ -232,7 +233,7 @@ class NetworkOptions:
     """Encoder of the actor: its own (separate; always with critic_states), or the critic's, which the actor's loss does not
     update (shared)."""
     target_encoder: bool = True
-    """Use slowly updated target encoders; if false, the target heads read the latents of the online encoders."""
+    """Use slowly updated target encoders (ddpg, td3); if false, the target heads read the latents of the online encoders."""
     random_shift: Annotated[int, Bounds(0, MAX_COUNT)] = 0
     """Random shift augmentation: maximum shift in pixels per axis, the same for the three images of a transition (Kostrikov et
     al., 2020)."""
@@ -252,8 +253,7 @@ class StudyOptions:
     """Mean age of sampled transitions, in transitions: older ones are sampled less often, as if new episodes replaced random
     ones. None: uniform sampling."""
     n_step: Annotated[Count, NEEDS_STATES] = 1
-    """Number of rewards summed in a target before it bootstraps. More than 1 needs true states and a method without a
-    filter."""
+    """Number of rewards summed in a target before it bootstraps. More than 1 needs method oracle, and excludes aux_tasks."""
     reward_noise: Annotated[NotNegative, NEEDS_STATES] = 0.0
     """Standard deviation of the noise on the state from which the oracle's reward is computed, in the unit of the state."""
     reward_false_positives: Annotated[Fraction, NEEDS_STATES, FALSE_REWARD] = 0.0
@@ -286,7 +286,8 @@ class StudyOptions:
     weighting_total: Annotated[Positive | None, OfWeighting(LIMITED_WEIGHTINGS)] = None
     """Sum to which the weights are scaled, excluding a main loss whose weight is always 1. None: not scaled."""
     weighting_cosines: Annotated[bool, OfWeighting()] = False
-    """Log the cosines between the losses' gradients in the critic's encoder; this computes the dot products of all pairs."""
+    """Log the cosines between the losses' gradients in the critic's encoder (the actor's with critic_states); this computes
+    the dot products of all pairs."""
     aux_form: Annotated[Literal["thesis", "release"], OfWeighting()] = "thesis"
     """Form of the auxiliary tasks' targets, where the thesis and the authors' release differ (`auxtasks.Options`)."""
 

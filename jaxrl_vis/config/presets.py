@@ -66,7 +66,7 @@ class TaskValues:
     Attributes:
         always: Values for every method.
         images: Values for image observations, except with a reward model trained alongside, which compares images.
-        oracle: Values for rewards from the true state, which other methods cannot read; they have their own balancing.
+        oracle: Values for rewards from the true state (method oracle).
         images_and_oracle: Values for images with rewards from the true state.
     """
 

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from jaxrl_vis.errors import RequestError
 
 START_S = 120
-"""Time that a process waits for the others at startup, s."""
+"""Default time that a process waits for the others at startup, s."""
 _HEARTBEAT_S = 20  # a process without heartbeat for this long is considered dead, and the others are ended
 _SHUTDOWN_TIMEOUT_S = 30
 _EXIT_TIMEOUT_S = 10

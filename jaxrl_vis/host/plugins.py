@@ -1,4 +1,4 @@
-"""Lookup of named parts of a run: built-in ones by name, custom ones as ``module:Name``. Imports no JAX by itself.
+"""Lookup of a run's components: built-in ones by name, custom ones as ``module:Name``. Imports no JAX by itself.
 
 Applies to algorithms, reward methods, auxiliary losses and weightings, and likewise to tasks (`jaxrl_vis_envs.task_modules`). A
 module is imported from ``Config.env_folder``, else from the current folder, else from Python's search path.
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def custom_names(config: Config) -> dict[str, str]:
-    """Return the custom parts ``module:Name`` of a configuration, by their role: task, algorithm, aux_tasks 1, ..."""
+    """Return the custom components ``module:Name`` of a configuration, by role: task, algorithm, aux_tasks 1, ..."""
     names = {"task": config.environment.env}
     for field, hint in fields.hints(Config).items():
         if not fields.names_components(hint):
@@ -29,16 +29,16 @@ def custom_names(config: Config) -> dict[str, str]:
 
 
 def find(kind: str, name: str, known: Mapping[str, T], folder: str | None = None) -> T | Any:
-    """Return a part by name; a ``module:Name`` is imported.
+    """Return a component by name; a ``module:Name`` is imported.
 
     Args:
-        kind: Kind of the part, for messages.
+        kind: Kind of the component, for messages.
         name: A key of ``known``, or ``module:Name``.
-        known: Built-in parts by name.
-        folder: Folder from which modules are imported first.
+        known: Built-in components by name.
+        folder: Folder from which modules are imported first; None to begin with the current folder.
 
     Raises:
-        RequestError: There is no such part, or its module cannot be imported.
+        RequestError: There is no such component, or its module cannot be imported.
     """
     if not task_modules.is_custom(name):
         if name not in known:
@@ -52,7 +52,7 @@ def find(kind: str, name: str, known: Mapping[str, T], folder: str | None = None
 
 
 def load(name: str, folder: str | None = None) -> tuple[ModuleType, str]:
-    """Import the module of ``module:Name``, and return it with the second half of the name.
+    """Import the module of ``module:Name``; return it and ``Name``. For ``folder`` see `find`.
 
     Raises:
         RequestError: ``name`` does not have this form, or the module cannot be imported.
@@ -65,13 +65,13 @@ def load(name: str, folder: str | None = None) -> tuple[ModuleType, str]:
 
 
 def call(kind: str, name: str, maker: Any, *arguments: Any, of: type) -> Any:
-    """Call the function of a custom part, and return its result after checking the type.
+    """Call the function that builds a component, and return its result after checking the type.
 
     Args:
         kind, name: As in `find`, for messages.
-        maker: The function, or the part itself, which is returned as it is.
+        maker: The function, or the component itself, which is returned as it is.
         arguments: Arguments of the function.
-        of: Class of the part.
+        of: Class of the component.
 
     Raises:
         RequestError: The function fails, or returns another type.

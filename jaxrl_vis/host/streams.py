@@ -84,7 +84,7 @@ def safe(stream: Any) -> SafeStream:
 
 
 def echo(line: str) -> None:
-    """Print a line to stdout; never raises."""
+    """Print a line to stdout, ignoring errors."""
     print(line, flush=True, file=safe(sys.stdout))
 
 

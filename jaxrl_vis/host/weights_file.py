@@ -70,7 +70,13 @@ def _quantise(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _restore(high: np.ndarray, low: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Restore a quantised array to float32 from its upper 8 bits, its packed lower 2 bits and its scales."""
+    """Restore an array [..., C] float32 from the results of `_quantise`.
+
+    Args:
+        high: [..., C] int8, upper 8 bits.
+        low: [ceil(numbers / 4)] uint8, lower 2 bits, four numbers in each byte.
+        scale: [C] float32.
+    """
     lower = ((low[:, None] >> _BIT_SHIFTS) & 3).ravel()[: high.size].reshape(high.shape)
     return (4 * high.astype(np.float32) + lower.astype(np.float32)) * scale
 
@@ -193,7 +199,7 @@ def check_range(path: Path, name: str, values: tuple[float, ...], low: float, hi
         step: Divisor of each number, for whole numbers.
 
     Raises:
-        RequestError: A number is out of range, or there are none or more than 16.
+        RequestError: A number is out of range or not divisible by ``step``, or there are none or more than 16.
     """
     unfit = next((value for value in values if not low <= value <= high or (step > 1 and value % step)), None)
     if unfit is not None or not 1 <= len(values) <= 16:

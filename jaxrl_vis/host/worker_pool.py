@@ -85,7 +85,9 @@ class UnorderedMap(Protocol):
 
 @contextlib.contextmanager
 def worker_pool(workers: int) -> Iterator[UnorderedMap]:
-    """Context of worker processes that share the GPUs and cores, killed after an error and when this process ends.
+    """Start worker processes that share the GPUs and cores, and yield a map over them; stop them at the end of the context.
+
+    They are killed after an error, and exit if this process ends.
 
     Args:
         workers: Number of processes; 1 or less for this one.

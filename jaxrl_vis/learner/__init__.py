@@ -1,1 +1,3 @@
-"""Pure functions of arrays, in the order of the data: rollout, replay, sampling, ddpg, train_step, evaluate."""
+"""Learners as pure functions of arrays: `train_step` composes an iteration of rollouts and evaluations (`acting`), replay and
+sampling (`memory`), algorithms (`ddpg`, `td3`, `contrastive`), networks and auxiliary tasks.
+"""

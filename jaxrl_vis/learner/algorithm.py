@@ -4,6 +4,8 @@
     update          all gradient steps of an iteration, on batches sampled from the replay
     policy_params   the part of an agent needed for acting: small, and sufficient for a policy
     act             actions without exploration
+    aim             representation of the goals that ``act`` takes, computed once per episode
+    diagnose        further metrics of a rollout
 
 An algorithm is built by a function of a `Setup`, which holds the configuration and the sizes of the task. DDPG, TD3 and
 contrastive RL are built in (`train_step.ALGORITHMS`); ``--algorithm module:Name`` selects a custom one. `networks.policy`
@@ -33,12 +35,13 @@ class Setup:
 
     Attributes:
         config: Configuration of the run.
-        resolved: Discount, rewards, bounds of targets.
+        resolved: Discount, rewards and bounds of targets derived from ``config``.
         observation_spec: Shape and dtype of an observation: [C, H, W] uint8 or [S] float32.
         action_size: A; actions lie in [-1, 1].
         auxiliary: Auxiliary tasks of the run and their weighting; an algorithm may ignore them.
-        shards: Shards of the learner: batches are those of one shard, gradients and metrics must be those of the whole.
-        critic_state_size: P, size of the true states that the critic observes instead of images; 0 for what the actor observes.
+        shards: Shards of the learner: each reads its own batches, and the algorithm averages gradients and metrics over them.
+        critic_state_size: P, size of the true states that the critic observes instead of images; 0 if it observes the same as
+            the actor.
     """
 
     config: Config
@@ -91,7 +94,7 @@ class Algorithm(NamedTuple):
     networks: Any = None
 
     def of_policies(self, statistics: Statistics) -> "Algorithm":
-        """Return the algorithm for agents that consist of policy parameters only: they can act, but not learn.
+        """Return the algorithm for agents that consist of policy parameters only: they can act, but ``update`` raises an error.
 
         Args:
             statistics: Initial observation statistics.

@@ -53,7 +53,15 @@ def split_key(key: jax.Array, iteration: jax.Array) -> jax.Array:
 
 
 def choose_batches(config: Config, sampler: Sampler, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> Batches:
-    """Choose the batches of all gradient steps at once: within the loop, sampling would run a dozen tiny kernels per step."""
+    """Choose the batches of all gradient steps at once: within the loop, sampling would run a dozen tiny kernels per step.
+
+    Args:
+        config: Configuration with the number of gradient steps.
+        sampler: Sampler of the replay.
+        replay: Replay of one learner, or one shard of it.
+        key: [] typed key, split into one per gradient step.
+        iteration: [] int32, iterations completed.
+    """
     keys = jax.random.split(key, config.run.updates_per_iteration)
     choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
     return Batches(choices, lambda choice: sampler.batch(replay, choice))

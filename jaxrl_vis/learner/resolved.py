@@ -21,7 +21,8 @@ class Resolved:
         balance_probability: p2.
         filter_threshold: q0; infinity if the method does not filter.
         critic_output_bias: Initial bias of the critic's output, about its prediction before training.
-        target_minimum, target_maximum: Bounds of the critic's targets.
+        target_minimum, target_maximum: Bounds of the critic's targets, R-/(1-gamma) and R+/(1-gamma); the maximum is infinite
+            without ``clip_targets_above``.
     """
 
     method: Method

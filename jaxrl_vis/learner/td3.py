@@ -20,7 +20,7 @@ NOISE, CLIP = 0.2, 0.5
 
 
 def make(setup: Setup) -> Algorithm:
-    """Build TD3."""
+    """Build TD3; errors as in `ddpg.make`."""
     run, shards = setup.config.run, setup.shards
 
     def draw_noise(key: jax.Array, count: int) -> jax.Array:

@@ -1,13 +1,13 @@
-"""One training iteration, for one or several seeds, as two compiled programs that are called in turn.
+"""One training iteration, for one or several seeds, as compiled programs that are called in turn.
 
     keys        random keys of this iteration's rollout, derived from fold_in(key of the seed, iteration)
     play        reset, then scan over T: act, advance, observe            -> episodes of all environments or of one part
     learn       replay, statistics, gradient steps, metrics (`iteration`)
 
-XLA compiles the two in parallel, and splitting them costs nothing: episodes are in the device's memory in either case, and
-neither program waits for the host. `vmap` over the seed axis trains several learners at once. The loop state is donated to
-`learn`, so the replay is updated in place. On several devices (`sharding`) each runs all of this on its part of the seeds,
-or of one learner.
+XLA compiles `play` and `learn` in parallel, and splitting them costs nothing: episodes are in the device's memory in either
+case, and neither program waits for the host. `vmap` over the seed axis trains several learners at once. The loop state is
+donated to `learn`, so the replay is updated in place. On several devices (`sharding`) each runs all of this on its part of the
+seeds, or of one learner.
 """
 
 import dataclasses
@@ -64,7 +64,7 @@ class TrainStep:
         layout: Placement of seeds and shards; all programs take and return arrays with this placement.
         exploration: Exploration noise of training; evaluations have none.
         plays_parts: True if ``play`` can start at any environment, and thus also evaluate; otherwise it runs a whole rollout.
-        part_size: P, number of environments that one call of ``play`` steps, on all devices together.
+        part_size: P, number of each learner's environments that one call of ``play`` steps, on all devices together.
         init: keys [S] -> LoopState.
         keys: (keys [S], iteration []) -> keys [S] of this iteration's rollout.
         play: (TrainState, keys [S], number [] int32 of the first environment, `Exploration`) -> `PartResult`.
@@ -179,7 +179,7 @@ class TrainStep:
 
 
 def _object_mask(env: GoalEnv, config: Config, resolved: Resolved) -> Callable[[jax.Array], jax.Array] | None:
-    """Return the function that reads the object's mask from images, if the environment marks one, for indicators.
+    """Return the function that reads the object's mask from images, for indicators; None if the environment marks no object.
 
     Raises:
         RequestError: No reward reads the mask, or noise hides it.
@@ -200,7 +200,8 @@ def _full_state_size(env: GoalEnv, config: Config) -> int:
     """Return the size of `Episodes.full_states`, 0 if the critic does not observe true states.
 
     Raises:
-        RequestError: The critic should observe them, but all agents of this environment do, or it has none.
+        RequestError: ``critic_states`` is set, but observations are states already, or the environment has no
+            ``observe_state``.
     """
     if not config.ddpg.critic_states:
         return 0
@@ -223,7 +224,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         policy_alone: Whether agents are policy parameters only (`Algorithm.of_policies`), for acting without training.
 
     Raises:
-        RequestError: The configuration is contradictory.
+        RequestError: The configuration is invalid, or incompatible with the environment or the devices.
     """
     resolved = resolve(validate(config), env.horizon)
     layout = make_layout(config) if layout is None else layout

@@ -24,13 +24,14 @@ class Predictions:
     """Predictions and targets for each step of K episodes; None if the run does not have the task.
 
     Attributes:
-        reconstruction: [K, T, C or 1, H, W] uint8, of the observation before the action.
+        reconstruction: [K, T, C or 1, H', W'] uint8, of the observation before the action, without borders that do not fill a
+            block of the encoder.
         flow: [K, T, H, W] float32, magnitude of the optical flow, in pixels per step; stretched to [0, 1] with
             ``aux_form="release"``.
-        flow_predicted: The prediction of ``flow``; borders that do not fill a block of the encoder may be missing.
+        flow_predicted: [K, T, H', W'] float32, prediction of ``flow``, without these borders.
         rotated: [K, T, C, H, W] uint8, the rotated observation.
         angle: [K, T] float32, its rotation, degrees counter-clockwise.
-        angle_predicted: The prediction of ``angle``.
+        angle_predicted: [K, T] float32, prediction of ``angle``.
     """
 
     reconstruction: np.ndarray | None = None

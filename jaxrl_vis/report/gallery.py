@@ -67,7 +67,7 @@ def print_table(names: Sequence[str] | None = None) -> None:
 
 
 def _make_all(names: Sequence[str] | None) -> tuple[dict[str, Any], dict[str, str]]:
-    """Create the environments ``names``, or all; return them, and the errors of those that cannot be created, by name.
+    """Create the environments ``names``, all for None; return them, and the errors of those that cannot be created, by name.
 
     Raises:
         RequestError: One of ``names`` cannot be created.
@@ -101,7 +101,7 @@ class _Poses(NamedTuple):
 
 
 def image_environments() -> list[str]:
-    """Return the names of the environments that have image observations and can be drawn."""
+    """Return the names of the environments that have image observations and can be rendered."""
     return [name for name, env in _make_all(None)[0].items() if _sees_images(env) and _can_be_drawn(env)]
 
 
@@ -136,14 +136,18 @@ def render_poses(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
 
 
 def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[str]:
-    """Check that a gallery can be drawn. Call it before the drawing, which takes a minute.
+    """Check that a gallery can be rendered. Call it before rendering, which takes a minute.
+
+    Args:
+        path: Output file.
+        names: Names of environments; None for all of `image_environments`.
 
     Returns:
-        The environments to be drawn.
+        Names of the environments to be rendered.
 
     Raises:
         RequestError: The file cannot be written, its suffix is not an image format, or an environment has no images or cannot
-            be drawn.
+            be rendered.
     """
     try:  # Pillow registers suffixes of formats that it only reads, or that have no colours
         Image.new("RGB", (1, 1)).save(io.BytesIO(), Image.registered_extensions()[path.suffix.lower()])

@@ -85,7 +85,7 @@ class LiveScene:
         self._set_view(server, xpos, camera)
 
     def show(self, xpos: np.ndarray, xquat: np.ndarray, is_goal: bool = False) -> None:
-        """Move the robot, or its copy at the goal, to poses [B, 3] (m) and [B, 4]."""
+        """Move the robot, or with ``is_goal`` its copy at the goal, to body positions [B, 3] (m) and quaternions [B, 4]."""
         for body, frame in (self._goal if is_goal else self._robot).items():
             frame.position, frame.wxyz = xpos[body], xquat[body]
 

@@ -34,7 +34,7 @@ def gather(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[np.ndarray, np
 
 
 def format_steps(count: float, _: int | None = None) -> str:
-    """Format a number of steps as ``250 k`` or ``1.44 M``."""
+    """Format a number of steps as ``250 k`` or ``1.44 M``; the second argument, Matplotlib's tick position, is ignored."""
     if count >= 1e6:
         return f"{count / 1e6:g} M"
     return f"{count / 1e3:g} k" if count >= 1e3 else f"{count:g}"
@@ -48,7 +48,7 @@ def draw_median(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, 
         steps: [P] env_steps.
         values: [S, P], NaN for gaps.
         colour: The colour of both.
-        label: Label in the legend.
+        label: Label in the legend; None for no entry.
 
     Returns:
         The last median; NaN if there is no number at all.
@@ -123,7 +123,7 @@ def plot_run(
         title: The first line, bold.
         subtitle: The second line.
         unit: The unit of eval/goal_distance.
-        threshold: The distance below which an episode is a success; drawn as a dashed line.
+        threshold: The maximum distance of a success, drawn as a dashed line; None for no line.
 
     Returns:
         False if there are no rows and nothing was written.

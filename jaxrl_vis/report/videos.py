@@ -131,6 +131,11 @@ def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int
     """Draw all frames of a video; return them with their durations in seconds.
 
     The border turns green where the goal is reached, and red at the end of an episode that missed it.
+
+    Args:
+        episodes: Images of the episodes.
+        frame_seconds: Duration of a frame in seconds; the last frame of an episode is held longer.
+        max_episodes: Maximum number of episodes; further ones are left out.
     """
     num_episodes, num_frames = episodes.frames.shape[:2]
     count = min(num_episodes, max_episodes)

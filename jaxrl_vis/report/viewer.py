@@ -35,7 +35,7 @@ class PosedEpisodes(NamedTuple):
 
     Attributes:
         positions, rotations: [E, T+1, B, 3] (m) and [E, T+1, B, 4], unit quaternions, scalar first.
-        goal_positions, goal_rotations: [E, B, 3] and [E, B, 4].
+        goal_positions, goal_rotations: [E, B, 3] and [E, B, 4], in the same form.
     """
 
     positions: jax.Array

@@ -103,7 +103,7 @@ def _process(line: bytes) -> Process | None:
 
 
 class Goodput:
-    """Account of the training process. Nothing is written before `begin`.
+    """Counter of the iterations begun by this process, in its line of the file. Nothing is written before `begin`.
 
     Args:
         path: processes.jsonl.
@@ -138,7 +138,7 @@ class Goodput:
         self._file = self._path.open("r+b", buffering=0)
 
     def count(self) -> None:
-        """Record the start of one more iteration."""
+        """Record the start of one more iteration; after a write error, only in memory."""
         self._own.begun += 1
         if self._file is None:
             return

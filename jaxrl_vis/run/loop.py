@@ -5,8 +5,8 @@
     at a boundary (evaluation, checkpoint, signal): also read the current iteration, then evaluate, write metrics, save
 
 All checks that can refuse a run (folder, lock, memory, checkpoints, compilation, memory again) come before the first byte is
-written or deleted. Metrics are on the disk before the checkpoint of the same iteration is, so a checkpoint never runs ahead of
-metrics.jsonl; and nothing is saved before the iteration's metrics have been read and found finite.
+written or deleted. Rows of metrics.jsonl are on the disk before the checkpoint of the same iteration, unless that records its
+evaluation as due; and nothing is saved before the iteration's metrics have been read and found finite.
 
 With several processes (`jaxrl_vis.host.distributed`), all train, evaluate and save; only the first writes everything else. They
 check for signals only at boundaries, where they synchronise anyway.
@@ -167,7 +167,7 @@ class RunLoop:
             self._folder.check_ownership(self._checkpoints.run_id, self._lock)
 
     def _ownership_error(self) -> FolderGoneError | None:
-        """Return why nothing can be saved any more; None if the run folder still belongs to this run."""
+        """Return the error if the run folder no longer belongs to this run, and remove the progress bar; None if it does."""
         try:
             self._check_ownership()
         except FolderGoneError as gone:

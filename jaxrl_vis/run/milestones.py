@@ -14,7 +14,7 @@ from jaxrl_vis.run.storage.progress import Progress
 from jaxrl_vis.types import LoopState
 
 SCORE, SCORED = "score", "scored"
-"""Keys of the manifest of a best checkpoint: its score, and the metric."""
+"""Keys of the progress in a best checkpoint's manifest: its score, and the name of the metric."""
 
 
 class Milestones:
@@ -23,10 +23,10 @@ class Milestones:
     The best score is stored only in the manifest of the best checkpoint, from which a resumed run reads it.
 
     Args:
-        config: The run.
-        checkpoints: Its checkpoints.
-        saver: Saves them.
-        echo: Prints a line.
+        config: Configuration of the run; without ``best_by``, no best checkpoint is saved.
+        checkpoints: Checkpoints of the run.
+        saver: Writer of these checkpoints.
+        echo: Called with one line about each unreadable manifest.
     """
 
     def __init__(self, config: Config, checkpoints: Checkpoints, saver: Saver, echo: Callable[[str], None]):
@@ -34,7 +34,7 @@ class Milestones:
         self._best: float | None = None
 
     def begin(self) -> None:
-        """Read the best score so far."""
+        """Read the best score so far from the best checkpoint, if there is one with the same metric."""
         if self._config.run.best_by is None:
             return
         for iteration in reversed(self._checkpoints.iterations(BEST)):
@@ -49,10 +49,10 @@ class Milestones:
                 return
 
     def save_if_best(self, loop: LoopState, iteration: int, values: PerSeed, progress: Progress) -> None:
-        """Save the learner if its evaluation is the best.
+        """Save the learner if its evaluation is the best so far; do nothing without ``best_by``.
 
         Args:
-            loop: The state.
+            loop: State of the loop after the evaluated iteration.
             iteration: Iterations completed.
             values: Metrics of the evaluation.
             progress: Progress of the host.

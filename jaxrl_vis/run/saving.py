@@ -65,7 +65,12 @@ class Saver:
         return distributed.any_process(iteration in self._checkpoints.iterations(tier))
 
     def save_light(self, loop: LoopState, iteration: int, progress: Progress) -> None:
-        """Save the learner in the background.
+        """Save the learner in the background; without a ``full_checkpoint_interval``, delete older full checkpoints.
+
+        Args:
+            loop: The state.
+            iteration: Iterations completed.
+            progress: Progress of the host.
 
         Raises:
             NonFiniteError: The state is not finite; it was dumped instead.
@@ -78,20 +83,17 @@ class Saver:
             self._checkpoints.retire_full()
 
     def save_best(self, loop: LoopState, iteration: int, progress: Progress, about: Mapping[str, Any]) -> None:
-        """Save the learner as the best one, and wait for the disk. Raises as `save_light`.
+        """Save the learner as the best one, and wait for the disk. Arguments and errors as for `save_light`.
 
         Args:
-            loop: The state.
-            iteration: Iterations completed.
-            progress: Progress of the host.
-            about: Additional entries of its manifest.
+            about: Additional entries of the progress in its manifest.
         """
         self._check()
         self._refuse_nonfinite(loop, iteration)
         self._checkpoints.save_best(iteration, loop.train, {**dataclasses.asdict(progress), **about})
 
     def save_full(self, loop: LoopState, iteration: int, progress: Progress) -> None:
-        """Save the complete state and wait for the disk. Raises as `save_light`."""
+        """Save the complete state and wait for the disk. Arguments and errors as for `save_light`."""
         self._check()
         self._refuse_nonfinite(loop, iteration)
         self._checkpoints.save_full(iteration, loop, dataclasses.asdict(progress))

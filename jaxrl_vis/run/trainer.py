@@ -38,7 +38,7 @@ class Trainer:
     """Configuration, its programs, and the run folder. Nothing is compiled, allocated or written at first.
 
     Args:
-        config: The run.
+        config: Configuration of the run.
         program: From `jaxrl_vis.learner.train_step.make_train_step`, or anything with the same attributes.
         run_dir: Folder of the files of `run`; None for `jaxrl_vis.run.storage.folder.default_folder`.
         resume: Whether to continue the run in ``run_dir``.
@@ -47,9 +47,9 @@ class Trainer:
         cache_programs: Whether to cache traced programs between processes (`jaxrl_vis.run.compiled.trace_cache`).
 
     Attributes:
-        config: The run.
+        config: Configuration of the run.
         env: The environment.
-        programs: The compiled functions and their sizes.
+        programs: Programs of the configuration, each compiled at its first use.
         folder: The run folder.
         seeds: The seeds, in the order of the seed axis.
 
@@ -126,7 +126,7 @@ class Trainer:
         """Evaluate the policy without noise: ``eval/success``, ``eval/goal_distance`` and its median, [S] float32.
 
         Args:
-            loop: The learner.
+            loop: State of the loop, or of the learner alone.
             key: Typed key [] that determines the episodes; None for the same ones at every call.
 
         Raises:
@@ -184,7 +184,7 @@ def make_trainer(
     """Build the environment and the programs of a configuration. Nothing is compiled, allocated or written.
 
     Args:
-        config: The run.
+        config: Configuration of the run.
         run_dir: Folder of the files of `Trainer.run`; None for one below ``runs/``, named after the configuration.
         resume: Whether to continue the run in that folder; an empty one starts a new run, with a message.
         overwrite: Whether to delete the run in that folder and start again.
@@ -194,7 +194,7 @@ def make_trainer(
         policy_alone: Whether the learner is only a policy, which cannot be trained (`Algorithm.of_policies`).
 
     Raises:
-        RequestError: The configuration is contradictory, differs from the saved run, or needs devices that are missing; the
+        RequestError: The configuration is invalid, differs from the saved run, or needs devices that are missing; the
             folder has other contents; or a logger is unknown or its library is missing.
     """
     if not isinstance(config, Config):

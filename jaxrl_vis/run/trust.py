@@ -62,7 +62,7 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
 
 
 def check(run_dir: Path, config: Config, is_permitted: bool, hint: str = "pass trust=True") -> None:
-    """Check that the code of a run may be imported; the permission ``is_permitted`` is stored.
+    """Check that the code of a run may be imported; store the permission if the user gives it.
 
     Args:
         run_dir: The run folder.

@@ -5,7 +5,7 @@
     5.6   weights of OL-AUX-5 over training
     5.7   OL-AUX-5, its ablation, OL-AUX-1
 
-Every figure also has a run without auxiliary losses as the reference of speed-ups. Runs are shared between figures.
+Every figure but 5.6 also has a run without auxiliary losses as the reference of speed-ups. Runs are shared between figures.
 """
 
 from collections.abc import Sequence

@@ -30,6 +30,9 @@ def bootstrap_interval(scores: Sequence[np.ndarray], level: float = 0.95, seed: 
         scores: One array of scores per task, [S].
         level: Coverage of the interval.
         seed: Seed of the resampling.
+
+    Returns:
+        Lower and upper end of the interval.
     """
     random = np.random.default_rng(seed)
     samples = [values[random.integers(len(values), size=(RESAMPLES, len(values)))] for values in map(np.asarray, scores)]

@@ -134,7 +134,7 @@ class LossDerivatives:
 
     Attributes:
         losses: [] float32 by name.
-        of_params: Gradients by loss and by index of the parameters' leaf.
+        of_params: Gradients by loss and by index of the parameters' leaf, each shaped like that leaf.
         at_latents: See `AtLatents`.
         extra: Auxiliary output of the loss function; None if it has none.
     """

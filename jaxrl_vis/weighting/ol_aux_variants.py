@@ -52,7 +52,7 @@ def ol_aux_window(
     Args:
         interval, learning_rate, beta, log, eps, main_eps, minimum, maximum, heads: See `ol_aux.ol_aux`.
         main_grad: main for the gradient of the main loss (thesis), or total for that of the whole weighted objective, which
-            adds w_i |g_i|^2 to each dot product (release).
+            adds the sum over auxiliary losses j of w_j <g_j, g_i>, and thus w_i |g_i|^2, to each dot product (release).
         window: Number of latest updates over which gradients are averaged; 4 in the release, 1 in the thesis.
         multiplicative: Whether to compare w_i g_i instead of g_i, as in the authors' quadratic example.
 

@@ -69,7 +69,7 @@ def make_weighting(name: str, **options: Any) -> Weighting:
 
     Args:
         name: One of `WEIGHTINGS`.
-        options: Arguments of its constructor.
+        options: Arguments of its constructor; for ol_aux also of `ol_aux_window`, which is slower and used only if needed.
 
     Raises:
         RequestError: The weighting or an option is unknown, or an option's value is invalid.

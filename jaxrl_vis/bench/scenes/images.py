@@ -60,8 +60,8 @@ class Case:
     """One scene in one variant, batch and image size.
 
     Attributes:
-        config: Entries of a record: scene, poses, textures, highlights, image_size, images; shadows and cameras if there are
-            shadows, or several cameras.
+        config: Entries of a record: scene, poses, textures, highlights, image_size, images; shadows, for variants that differ
+            in them; and cameras, if there are several.
         mj_model: Model; its first cameras are used.
         batches: Two sets of poses, see `models.random_poses`; the first `worlds` of each are rendered.
     """

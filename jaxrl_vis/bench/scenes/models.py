@@ -28,9 +28,9 @@ def load(scene: str, textures: bool = True, highlights: bool = True, shadows: bo
         scene: ``finger`` (from the dm_control suite), ``fetch_reach`` (ours), ``primitives`` (127 mixed primitives on and
             over a table), ``clutter`` (500 meshes), one of `packaged.PACKAGED` (robots with the meshes of their packages), or
             the path of an MJCF file with a camera.
-        textures: Keep the textures of materials and sky.
-        highlights: Keep the specular component of lights.
-        shadows: Keep the shadows of lights that cast any.
+        textures: Whether to keep the textures of materials and sky.
+        highlights: Whether to keep the specular component of lights.
+        shadows: Whether to keep the shadows of lights that cast any.
 
     Raises:
         RequestError: The scene is unknown, its package is missing, its file is not a model, or it has no camera.
@@ -174,7 +174,13 @@ def forward(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
 
 
 def random_poses(mj_model: mujoco.MjModel, count: int, seed: int, spread: float = 1.0) -> dict[str, np.ndarray]:
-    """Compute poses in world coordinates for ``count`` random joint positions, see `scatter_joints`.
+    """Compute poses in world coordinates for ``count`` random joint positions.
+
+    Args:
+        mj_model: Model.
+        count: Number of poses.
+        seed: Seed of the joint positions.
+        spread: See `scatter_joints`.
 
     Returns:
         Arrays [count, ...] float32 by name (`POSES`), shaped as in MjData.

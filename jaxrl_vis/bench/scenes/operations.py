@@ -28,7 +28,7 @@ def operations_per_pixel(scene: Scene, tests: np.ndarray, coloured: bool = True)
     Args:
         scene: Scene; the cost of haze, shadows and transparent objects is not included.
         tests: [ngeom] float, tests per pixel of each geom, see `models.needed_tests`.
-        coloured: Count shading in addition to depth, which the tests themselves yield.
+        coloured: Whether to count shading in addition to depth, which the tests themselves yield.
 
     Returns:
         Number of operations; None for a scene with triangles, whose tests are not counted.

@@ -23,7 +23,7 @@ class Dataset(TrustOption):
     episodes: int | None = None
     """Number of episodes; 50 for a run, all for a conversion, if not given."""
     seed: int = 0
-    """Seed of the starts and goals of a run's episodes."""
+    """Seed of the starts and goals of a run's episodes; unused by a conversion."""
 
 
 def run(options: Dataset) -> int:

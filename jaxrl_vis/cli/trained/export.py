@@ -22,7 +22,7 @@ class Export(TrustOption, CheckpointOption):
     """
 
     run_dir: Annotated[Path | None, AlsoPositional()] = None
-    """The run folder, or the name of a policy that comes with the package, such as fetch."""
+    """The run folder, or the name of a policy that comes with the package, such as fetch; not with --check."""
     format: Literal["onnx", "stablehlo", "safetensors"] = "onnx"
     """Format: ONNX (needs the extra ``export``), StableHLO for JAX without this project, or weights by name."""
     out: Path | None = None
@@ -33,7 +33,8 @@ class Export(TrustOption, CheckpointOption):
     overwrite: bool = False
     """Replace an exported policy in the folder."""
     check: Path | None = None
-    """Export nothing: run this exported file on its golden frames, and print the maximum difference."""
+    """Export nothing: run this exported file on its golden frames, and print the maximum difference. --format, --seed and
+    --checkpoint are then unused."""
 
 
 def run(options: Export) -> int:

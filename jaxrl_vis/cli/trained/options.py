@@ -16,4 +16,4 @@ class TrustOption:
     """Option of a command that may run a run's custom code; see `checks.may_run_code`."""
 
     trust: bool = False
-    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
+    """Execute the run's custom code (module:Name) without asking, even if it was not trained here (docs/runs.md)."""

@@ -18,8 +18,8 @@ class Play(TrustOption, CheckpointOption):
     run_dir: Annotated[Path, AlsoPositional()]
     """The run folder, or the name of a policy that comes with the package, such as fetch."""
     out: Path | None = None
-    """A .gif, .mp4 or .html file, or a .png of some steps; play.gif (play.html with --html, play_aux.gif with --aux) in the run
-    folder if not given (for a policy of the package, in NAME/ in the current folder)."""
+    """A .gif, .mp4 or .html file, or a .png of some steps; play.gif (play.html with --html, play_aux.gif with --aux, live.gif
+    with --live) in the run folder if not given (for a policy of the package, in NAME/ in the current folder)."""
     html: bool = False
     """Write a page with a three-dimensional view of robot and goal in brax's viewer (needs brax; the page needs a network)."""
     live: bool = False
@@ -27,7 +27,7 @@ class Play(TrustOption, CheckpointOption):
     aux: bool = False
     """Also show the predictions of auxiliary tasks: reconstruction, true and predicted optical flow, rotated image."""
     episodes: int = 6
-    """Number of episodes to show."""
+    """Number of episodes to show; unused with --live."""
 
 
 def run(options: Play) -> int:

@@ -19,10 +19,11 @@ class Evaluation(NamedTuple):
     """Result of an evaluation.
 
     Attributes:
-        metrics: [S] float32 by name: means over all episodes, as ``eval/`` and a name of `GoalEnv.metric_names`, and
+        metrics: [S] float32 by name, over all episodes: means of `GoalEnv.metric_names`, each prefixed by ``eval/``, and
             ``eval/goal_distance_median``.
-        recording: ``frames`` [S, K, T+1, ...], ``goals`` [S, K, ...] and ``success`` [S, K] of the first K episodes of each
-            shard of each seed (`num_recorded`).
+        recording: ``frames`` [S, K, T+1, ...] and ``goals`` [S, K, ...] in the dtype of observations, without older stacked
+            images, and ``success`` [S, K] float32, of the first K episodes of one shard of each seed (`num_recorded`); D * K
+            episodes once D shards are assembled.
     """
 
     metrics: Metrics

@@ -27,8 +27,8 @@ class Exploration(NamedTuple):
     """Exploration noise of actions; none by default.
 
     Attributes:
-        random_action_probability: Probability that an action vector is replaced by a uniformly sampled one.
-        action_noise: Standard deviation of the Gaussian noise on the others.
+        random_action_probability: Probability that an action vector is replaced by a uniformly sampled one; float or [].
+        action_noise: Standard deviation of the Gaussian noise on the others; float or [].
     """
 
     random_action_probability: float | jax.Array = 0.0
@@ -106,7 +106,8 @@ class Rollout(NamedTuple):
     Attributes:
         episodes: [S, K, ...] kept episodes.
         outcome: [S, E] by name, metrics (`GoalEnv.metric_names`) of all episodes at their last step.
-        record: [S, K, T+1, ...] results of ``record`` for the kept episodes' states after 0, 1, ..., T steps; or None.
+        record: [S, K, T+1, ...] results of ``record`` for the kept episodes' states after 0, 1, ..., T steps; None without
+            this function.
     """
 
     episodes: Episodes
@@ -140,7 +141,8 @@ def play(
         num_envs: E, number of environments per learner in this call.
         exploration: Exploration noise.
         num_kept: K, number of episodes to keep (the first ones); None for all.
-        record: Function of the state of one environment that returns a pytree to record, after reset and after each step.
+        record: Function of the state of one environment that returns a pytree to record, after reset and after each step; None
+            to record nothing.
         draws: Source of random numbers for these environments.
     """
     env, algorithm, deviation, observe_state = acting

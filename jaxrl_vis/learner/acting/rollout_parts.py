@@ -87,7 +87,7 @@ def part_result_spec(env: GoalEnv, size: int, seeds: int, full_state_size: int =
         env: The environment.
         size: P, number of environments in the part.
         seeds: S.
-        full_state_size: P - G, size of `Episodes.full_states`; 0 if they are not collected.
+        full_state_size: Size of `Episodes.full_states` of one step; 0 if they are not collected.
     """
 
     def spec(shape: tuple[int, ...], dtype: Any = jnp.float32) -> Any:

@@ -4,7 +4,7 @@
     inverse_dynamics   latent, next latent  -> action
     egomotion          latent, latent of the image rotated -> angle
     autoencoder        latent               -> image
-    optical_flow       latent, next latent  -> strength of the optical flow
+    optical_flow       latent, next latent  -> magnitude of the optical flow
 
 Each is a separate file with a function ``make`` of a `Spec`. An `AuxTask` declares its inputs; the learner encodes, stores and
 samples what the tasks of a run declare, without referring to any task by name.
@@ -37,7 +37,7 @@ def make(names: Sequence[str], spec: Spec, folder: str | None = None) -> dict[st
     Args:
         names: Names out of `NAMES`, or ``module:Name`` of functions of a `Spec` that return an `AuxTask`; may be empty.
         spec: Sizes of the observation, the action and the latent.
-        folder: Folder from which modules are imported first.
+        folder: Folder from which modules are imported first; None to begin with the current folder.
 
     Raises:
         RequestError: A name is unknown or occurs twice, a function does not return an `AuxTask`, two tasks have the same

@@ -48,7 +48,13 @@ def _neighbours(height: int, width: int, x: jax.Array, y: jax.Array) -> tuple[ja
 
 
 def _interpolate(pixel: Callable[[int], jax.Array], width: int, right: jax.Array, down: jax.Array) -> jax.Array:
-    """Interpolate bilinearly between four pixels; ``pixel`` returns values at an index relative to the upper left one."""
+    """Interpolate bilinearly between four pixels.
+
+    Args:
+        pixel: Function from an index, relative to that of the upper left pixel in a flat image, to values.
+        width: Width of the image.
+        right, down: Position between the four pixels, 0 to 1 from the upper left one; broadcast to the values.
+    """
     upper = (1.0 - right) * pixel(0) + right * pixel(1)
     lower = (1.0 - right) * pixel(width) + right * pixel(width + 1)
     return (1.0 - down) * upper + down * lower

@@ -90,7 +90,7 @@ class Transitions(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class View(Replaceable):
-    """Inputs of an auxiliary task's loss for B transitions; those that the task does not declare may be missing.
+    """Inputs of an auxiliary task's loss for B transitions; those that the task does not declare may be None.
 
     Attributes:
         latent_t: [B, L] any float dtype, of the observations before the action.
@@ -119,13 +119,14 @@ class AuxTask(NamedTuple):
         name: Unique among the tasks of a run; names its head, its metrics and its weight.
         init: key -> parameters of its head, a nested dictionary of float32.
         predict: (parameters, View) -> prediction of the head, float32: a latent [B, L], an action [B, A], a motion [B, 1 or 3],
-            an image [B, C, H, W] or a flow strength [B, H, W]. Images end where the encoder's last whole block does.
+            an image [B, C, H, W] or a flow magnitude [B, H, W]. Images end where the encoder's last whole block does.
         loss: (parameters, View) -> [] float32, such as the mean squared error of that prediction.
         needs: Optional fields of `View` that it reads, out of ``latent_tp1`` and ``image``.
         episode: [T + 1, C, H, W] uint8, images of an episode -> [T, ...] uint8 or float32. Computed once, when an episode is
-            collected: a transition is sampled 5 to 20 times.
+            collected, because a transition is usually sampled several times. None if nothing is stored.
         view: (key, Transitions) -> (images [B, C, H, W] uint8 to be encoded, target). The images are shifted like the batch.
-        target: Transitions -> target, for tasks without ``view``.
+            None if the task has no images of its own.
+        target: Transitions -> target, for tasks without ``view``; None if the loss needs no target.
         shift: (target, [B, 2] int32 pixels) -> target for images shifted by this down and to the right; None if the target does
             not change.
         number: Integer (uint32) folded into the task's random keys, so that its samples do not depend on the other tasks; None

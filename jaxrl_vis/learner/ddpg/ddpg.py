@@ -47,7 +47,7 @@ class Agent(Replaceable):
 
     Attributes:
         actor, critic: Online parameters. The actor is only a head if it shares the critic's encoder.
-        target_actor, target_critic: Slowly updated copies; only heads without target encoders.
+        target_actor, target_critic: Slowly updated copies; without target encoders, of the heads only.
         actor_optimizer, critic_optimizer: optax states.
         updates: [] int32, number of gradient steps taken (below 2^31 in any realistic run).
         weighting: `weighting.WeightingState` of the auxiliary losses; None without a weighting.
@@ -122,7 +122,7 @@ def _network_parameters(state: Agent) -> tuple[Params, ...]:
 
 
 def _start(networks: Networks, auxiliary: Auxiliary, learned_reward: LearnedReward | None, key: jax.Array) -> Agent:
-    """Initialise an agent; its target networks equal the online networks."""
+    """Initialise an agent; its target networks equal the online networks. ``learned_reward`` is None without a reward model."""
     actor_key, critic_key = jax.random.split(key)
     actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
     target_actor, target_critic = networks.init_target(actor), networks.init_target(critic)
@@ -300,7 +300,8 @@ def make_update(
             """Take gradient steps, of which only the last updates the actor; unrolled, so that the body has no conditional.
 
             Each step receives its prepared batch, and prepares the next one, which a GPU can do while it computes; otherwise,
-            it would have to wait for its own batch first.
+            it would have to wait for its own batch first. Returns the new state, and the means of the metrics, stacked in the
+            order of ``names``.
             """
             (working, prepared), rows = state, []
             for number in range(interval):
@@ -335,7 +336,7 @@ def _mean(values: list[jax.Array]) -> jax.Array:
 
 
 def make(setup: Setup) -> Algorithm:
-    """Build DDPG."""
+    """Build DDPG; errors as in `make_learned_reward`."""
     return build(setup)
 
 

@@ -118,7 +118,7 @@ class LearnedReward:
 
 
 def make_autoencoder(networks: Networks, config: Config, resolved: Resolved) -> LearnedReward:
-    """Build the reward model that compares observations in the latent space of an autoencoder."""
+    """Build the reward model that compares observations in the latent space of an autoencoder; see `make_learned_reward`."""
     shape = networks.observation_spec, networks.action_size, config.network.latent_size
     spec = auxtasks.Spec(*shape, levels=len(config.network.encoder_filters), dtype=networks.dtype)
     task = auxtasks.make(("autoencoder",), spec)["autoencoder"]
@@ -141,6 +141,7 @@ def make_classifier(networks: Networks, config: Config, resolved: Resolved) -> L
     """Build the reward model that classifies pairs of achieved observation and goal.
 
     All achieved observations are negatives, as in VICE, even if they equal the goal: both classes are then equally likely.
+    Arguments as for `make_learned_reward`.
     """
     head = networks.head(1)
 

@@ -27,7 +27,7 @@ def td_target(
     Args:
         reward_t: [B] float32, rewards of the transitions.
         value_tp1: [B] float32, the target critic's values of the target actor's actions in the next states.
-        discount: gamma.
+        discount: gamma, or its power for transitions of several steps, [B].
         minimum: Minimum target, R-/(1-gamma).
         maximum: Maximum target, R+/(1-gamma).
     """

@@ -38,8 +38,8 @@ class NetworkGradients(NamedTuple):
         critic, actor: Gradients for the optimisers, float32; ``actor`` is None if the actor is not updated. With
             `Objectives.reduces_early`, that of the network with the weighted losses is of the whole learner's batch.
         weighting: State of the weighting after this batch.
-        keep: [B], mask of unfiltered transitions.
-        action: [B, A] actions of the policy; None if the actor is not updated.
+        keep: [B] float32, 1 for unfiltered transitions and 0 for others.
+        action: [B, A] float32 in [-1, 1], actions of the policy; None if the actor is not updated.
         metrics: [] float32 by name.
     """
 

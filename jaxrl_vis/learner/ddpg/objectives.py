@@ -34,7 +34,12 @@ from jaxrl_vis.weighting import MAIN, Weighted, WeightingState, weighted_grad
 
 
 class ComputeCopies(NamedTuple):
-    """Compute copies of an agent's four networks (`Networks.compute_copy`), or their parameters with these substituted."""
+    """Compute copies of an agent's four networks (`Networks.compute_copy`), or their parameters with these substituted.
+
+    Attributes:
+        actor, critic: Online networks.
+        target_actor, target_critic: Target networks.
+    """
 
     actor: Params
     critic: Params
@@ -89,7 +94,7 @@ _MAIN_READS, _OTHERS_READ = "main", "others"
 
 
 def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[str, Callable[[Params], jax.Array]]:
-    """Return functions from encoder parameters to the latents of the main loss, and to those of auxiliary losses.
+    """Return functions from encoder parameters to the latents [observations, B, latent] of the main loss and of the others.
 
     Only the main loss reads goals, so separate encodings shorten the backward passes of auxiliary losses.
     """
@@ -165,7 +170,11 @@ class Objectives:
     ) -> Callable[[Params, WeightingState], Weighted]:
         """Build the function that computes the critic's losses and gradient; ``extra`` is (latents, values [B], keep [B]).
 
-        All heads are trained on the same target; ``values`` are the minimum over heads. ``noise`` as for `_target`.
+        All heads are trained on the same target; ``values`` are the minimum over heads.
+
+        Args:
+            copies: Parameters of the networks.
+            inputs, image, batch, noise: Fields of `network_gradients.PreparedBatch`; ``batch`` must have rewards.
         """
         networks = self.networks
 
@@ -182,7 +191,10 @@ class Objectives:
     def critic_error_on_states(
         self, critic: Params, copies: ComputeCopies, inputs: Inputs, batch: Batch, noise: jax.Array | None = None
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Compute the loss [] of a critic that observes true states; and (values [B], keep [B]) as in `critic_gradient`."""
+        """Compute the loss [] of a critic that observes true states; and (values [B], keep [B]) as in `critic_gradient`.
+
+        ``critic`` are the differentiated parameters; the target networks are those of ``copies``.
+        """
         target = self._target(copies, _next_actor_latents(self.networks, copies, inputs), inputs.states_tp1, batch, noise)
         main, value, keep = self._error(self.networks.values(critic, inputs.states_t, batch.action), target, batch)
         return main, (value, keep)
@@ -193,7 +205,7 @@ class Objectives:
         """Build the function that computes the losses and the gradient of an actor whose critic observes true states.
 
         ``extra`` are the actions [B, A]. The main loss is that of `actor_loss`; for a logarithm, it is raised by the maximum
-        value, so that it is positive.
+        value, so that it is positive. Arguments as for `critic_gradient`; the parameters ``critic`` are held constant.
         """
 
         def actor_losses(actor: Params, encoded: Latents | dict[str, jax.Array]):
@@ -250,7 +262,8 @@ class Objectives:
 
         Args:
             copies: Parameters of the networks.
-            of_actor, of_critic: What the target actor and the target critic read after the transition (`Networks.values`).
+            of_actor, of_critic: Inputs of the heads of the target actor and the target critic after the transition: latents
+                [2, B, latent] of observations and goals, or true states if the critic observes these (`Networks.values`).
             batch: Transitions with rewards.
             noise: [B, A], added to the next actions; None for no noise.
         """
@@ -276,6 +289,12 @@ class Objectives:
         """Compute the actor's loss [] and its actions [B, A].
 
         An actor with an encoder of its own also has auxiliary losses, with the critic's ``weights``, [] float32 by name.
+
+        Args:
+            actor, critic: Parameters; those of the critic are held constant.
+            inputs, image, batch: As in `critic_gradient`.
+            critic_latents: Latents of the critic's encoder, which an actor without an encoder reads, too.
+            weights: Weights of the critic's losses in this step, with `MAIN`.
         """
         has_encoder = not self.networks.shares_encoder
         latents, others = critic_latents, {}

@@ -13,7 +13,7 @@ def to_integers(fraction: jax.Array, count: int | jax.Array) -> jax.Array:
 
     Args:
         fraction: [...] float32 in [0, 1), such as from `jax.random.uniform`, whose resolution is 2**-23.
-        count: Number of integers, at least 1.
+        count: Number of integers, at least 1; broadcasts to ``fraction``.
     """
     # A number just below 1 may round up to `count` when it is scaled.
     return jnp.minimum(jnp.floor(fraction * count).astype(jnp.int32), count - 1)

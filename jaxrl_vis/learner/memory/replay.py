@@ -55,8 +55,8 @@ class Indices(NamedTuple):
     """Positions of B transitions: [B] int32 each.
 
     Attributes:
-        episode: In [0, N).
-        time: t in [0, T).
+        episode: Position of the episode in the replay, in [0, N).
+        time: t, number of the transition's first step, in [0, T).
     """
 
     episode: jax.Array
@@ -99,7 +99,8 @@ class Replay(NamedTuple):
             observation: Shape and dtype of one observation (`GoalEnv.observation_spec`).
             goal_state_size: G.
             action_size: A.
-            stored: Shapes and dtypes of the arrays stored with one episode, by auxiliary task (`Auxiliary.stored_spec`).
+            stored: Shapes and dtypes of the arrays stored with one episode, by auxiliary task (`Auxiliary.stored_spec`); None
+                for no such arrays.
             full_state_size: P - G, size of `Episodes.full_states`; 0 if they are not stored.
         """
         episodes, horizon = self.num_episodes, self.horizon

@@ -38,9 +38,9 @@ class Choice(NamedTuple):
         indices: Positions of the transitions, [B] each.
         goal_slot: [B] int32 in [t + 1, T + 1]; for goals from another episode, in [1, T].
         goal_episode: [B] int32, episodes of the goal slots; None for the transitions' own episodes.
-        shift: [B, 2] int32, see `Batch`; or None.
-        target_key: [] typed key, for targets of auxiliary tasks; or None.
-        clutter_end: [] float32, see `reward_errors`; or None.
+        shift: [B, 2] int32, see `Batch`; None without random shifts.
+        target_key: [] typed key, for targets of auxiliary tasks; None without any.
+        clutter_end: [] float32, see `reward_errors`; None if false rewards are not confined.
         is_replaceable: [B] bool, mask of relabelled goals to be replaced by another transition's if they are already reached;
             None if none is, or if true states have decided that (``goal_episode``).
     """
@@ -65,7 +65,7 @@ class Sampler:
         threshold: Threshold of the oracle's reward, in the unit of the true states.
         as_goal: [...] -> [...], converts an achieved observation to a goal (`GoalEnv.as_goal`); None if observations already
             have the form of goals.
-        auxiliary: Auxiliary tasks whose targets are added to batches.
+        auxiliary: Auxiliary tasks whose targets are added to batches; None for no targets.
         shards: Shards of the learner. ``replay`` and batches are those of one shard; the configured batch size is the total.
         mask: Mask of the elements that indicators compare (`rewards.make_reward`); None for all.
     """
@@ -216,7 +216,7 @@ class Sampler:
         return make_reward(self.config, self.resolved.method, self.mask)
 
     def _estimated_reward(self, batch: Batch, clutter_end: jax.Array | None) -> jax.Array:
-        """Compute the oracle's rewards [B] float32, with an estimator's errors if the configuration has any."""
+        """Compute the oracle's rewards [B] float32, with an estimator's errors if configured; ``clutter_end``: see `Choice`."""
         config, positive, negative = self.config, self.resolved.reward_positive, self.resolved.reward_negative
         states = (
             reward_errors.estimate(batch.state_tp1, config.study.reward_noise) if config.study.reward_noise else batch.state_tp1

@@ -1,7 +1,8 @@
 """Files of frozen image encoders: parameters of `modules.Encoder`, and the normalisation of the images.
 
 shape     [3] int64: C, H, W of the images
-mean      [C, H, W] float32; the same shape and dtype: ``scale``, 1 / standard deviation
+mean      [C, H, W] float32
+scale     [C, H, W] float32, 1 / standard deviation
 kernel_0, bias_0, ..., latent/kernel, latent/bias     float32
 """
 
@@ -33,7 +34,7 @@ def save(path: Path | str, encoder: Params, scaling: Scaling) -> None:
 
 
 def load(path: Path | str) -> Callable[[jax.Array], jax.Array]:
-    """Read an encoder from a file: images [B, C, H, W] uint8 -> vectors [B, L] float32.
+    """Read an encoder from a file; return the function images [B, C, H, W] uint8 -> vectors [B, L] float32.
 
     Raises:
         RequestError: The file is missing or not an encoder; or, when the encoder is called, images have another shape.

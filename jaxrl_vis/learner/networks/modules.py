@@ -1,4 +1,4 @@
-"""Modules of the networks: encoder of images, dense layer, head. The only file that uses flax.
+"""Modules of the networks: encoder of images, dense layer, head. The only file of the learner that uses flax.
 
 The encoder is a stack of 2x2 convolutions with stride 2. Such windows never overlap, so each layer IS a matrix product of
 [pixels, 4 * channels in] with [4 * channels in, channels out]. If the pixels are put into nested 2x2 blocks once,

@@ -84,7 +84,11 @@ class Inputs(NamedTuple):
         return self.observed.shape[0] // len(_OBSERVED)
 
     def pieces(self, *names: str) -> list[Piece]:
-        """Return slices of the observations ``names``, in this order: ``before``, ``goal``, ``after``, or names of views."""
+        """Return slices of the observations ``names``, in this order; adjacent ones are merged into one slice.
+
+        Args:
+            *names: ``before``, ``goal``, ``after``, or names of views.
+        """
         size, pieces = self.size, []
         for name in names:
             if name in self.views:
@@ -203,7 +207,7 @@ class Networks:
         return self._init(key, self.head(self.action_size, 0.0), 2 * self.latent_size, has_encoder=not self.shares_encoder)
 
     def init_critic(self, key: jax.Array) -> Params:
-        """Initialise the critic, {"encoder": ..., "head": ...}: without an encoder for states; heads are stacked [K, ...]."""
+        """Initialise the critic, {"encoder": ..., "head": ...}: without an encoder for states; K > 1 heads are stacked."""
         head = self.head(1, self.critic_output_bias)
         width = self.action_size + (self.critic_state_size or 2 * self.latent_size)
         critic = self._init(key, head, width, has_encoder=not self.critic_state_size)
@@ -293,7 +297,13 @@ class Networks:
         return jnp.clip((observations.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
 
     def encode(self, params: Params, inputs: jax.Array, which: slice = slice(None)) -> jax.Array:
-        """Encode the prepared observations ``which``: [B, latent]; a state vector is its own latent."""
+        """Encode prepared observations: [B, latent]; a state vector is its own latent.
+
+        Args:
+            params: Parameters of the actor or critic; only ``encoder`` is read.
+            inputs: Observations from `prepare`.
+            which: Slice of their first axis that is encoded, of length B.
+        """
         return self.encode_pieces(params, [(inputs, which)])
 
     def encode_pieces(self, params: Params, pieces: Sequence[Piece]) -> jax.Array:

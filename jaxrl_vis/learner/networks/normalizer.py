@@ -33,11 +33,11 @@ def init(observation_spec: jax.ShapeDtypeStruct) -> NormalizerState:
 def update(
     state: NormalizerState, observations: jax.Array, axes: tuple[int, ...] = (0, 1), shards: Shards = ONE
 ) -> NormalizerState:
-    """Merge the statistics of ``observations`` [E, T+2, ...] into the running ones.
+    """Merge the statistics of ``observations``, such as those of a rollout [E, T+2, ...], into the running ones.
 
     Args:
         state: Statistics so far.
-        observations: Observations in their own dtype, with leading axes to reduce.
+        observations: Observations in their own dtype, preceded by the axes to reduce.
         axes: Leading axes to reduce.
         shards: Shards of the learner; ``observations`` are those of one shard.
     """

@@ -17,7 +17,7 @@ class PolicyParams(NamedTuple):
     """Parameters of the policy.
 
     Attributes:
-        actor: Parameters of the actor, including an encoder (its own or the critic's).
+        actor: Parameters of the actor, for images including an encoder (its own or the critic's).
         observations, goals: Statistics for normalising observations and goals.
     """
 

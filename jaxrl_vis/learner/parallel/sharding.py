@@ -34,8 +34,8 @@ SEED = "seed"
 class Layout:
     """Placement of a run's seeds, and of each learner's shards, on devices; create it with `make_layout`.
 
-    Between iterations, the replay of a sharded learner is an array [S, rollouts, E, ...] instead of [S, rollouts * E, ...]: the
-    same bytes, so that a run may continue on another number of devices.
+    Between iterations, the arrays of a sharded learner's replay are [S, rollouts, E, ...] instead of [S, rollouts * E, ...]:
+    the same bytes, so that a run may continue on another number of devices.
 
     Attributes:
         mesh: Mesh of devices with the axes `SEED` and `DATA`; None for JAX's first device and plain arrays.
@@ -105,15 +105,19 @@ class Layout:
     def spread(
         self, function: Callable, in_specs: tuple, out_specs: Any, jit: Callable, kept_as: Any = None, **options: Any
     ) -> Any:
-        """Compile a function of one device's part so that it runs on all devices.
+        """Wrap a function of one device's part in `jax.shard_map` and ``jit``; on one device, in ``jit`` alone, without specs.
 
         Args:
             function: Function of one device's parts of its arguments.
             in_specs: A partition spec, or a tree of them, for each argument.
-            out_specs: A partition spec, or a tree of them, for the results.
+            out_specs: Partition specs by which the devices' results are assembled, a spec or a tree of them.
             jit: Compiling transformation, such as `jax.jit`.
-            kept_as: Partition specs of the final result; None for ``out_specs``.
+            kept_as: Partition specs to which the assembled results are then resharded, such as `replicated` for the host; None
+                for ``out_specs``.
             **options: Further arguments of ``jit``.
+
+        Returns:
+            The compiled function, of whole arrays.
         """
         if self.mesh is None:
             return jit(function, **options)
@@ -127,7 +131,7 @@ class Layout:
 
         Args:
             shapes: A pytree.
-            specs: Tree of partition specs, each of whose leaves covers a subtree of ``shapes``.
+            specs: Tree of partition specs, a prefix of the tree ``shapes``.
         """
         if self.mesh is None:
             return shapes
@@ -138,7 +142,7 @@ class Layout:
         return jax.tree.map(placed, self.shardings(specs), shapes)
 
     def put(self, tree: Any, specs: Any) -> Any:
-        """Place arrays by their specs, and return them; a leaf of ``specs`` covers a subtree. Unchanged on one device."""
+        """Return a tree of arrays placed by ``specs``, a prefix of the tree; unchanged on one device."""
         if self.mesh is None:
             return tree
 

@@ -106,8 +106,8 @@ def check_memory(
     """Estimate a run's memory, and compare it with a device's free memory.
 
     Args:
-        config: The run.
-        loop_shapes: The loop state's shapes, all seeds.
+        config: Configuration of the run.
+        loop_shapes: Shapes and dtypes of the loop state, of all seeds.
         replay_bytes: Bytes of one seed's replay.
         steps_per_iteration: Environment steps of one seed in an iteration; the replay's capacity is a multiple of it.
         layout: Placement of the run.

@@ -19,12 +19,12 @@ def _floating_leaves(tree: Any) -> dict[str, Any]:
 
 
 def nonfinite_leaves(loop: LoopState) -> dict[str, jax.Array]:
-    """Return for each floating-point leaf, by name, whether it has a NaN or an infinity, [] bool. Traceable under jit."""
+    """Return, by name of each floating-point leaf, True if it has a NaN or an infinity: [] bool. Traceable under jit."""
     return {name: ~jnp.isfinite(leaf).all() for name, leaf in _floating_leaves(loop).items()}
 
 
 def _episodes(loop: LoopState, *names: str) -> dict[str, np.ndarray]:
-    """Concatenate some fields of all episodes in the replay, [S, N, T..., values] float32."""
+    """Copy fields of all episodes in the replay to the host, by name: [S, N, steps, components] float32."""
     episodes = {name: np.asarray(getattr(loop.replay.episodes, name)) for name in names}
     # If devices share a learner, episodes are indexed by rollout and environment (`sharding.Layout`).
     return {name: array.reshape(len(array), -1, *array.shape[-2:]) for name, array in episodes.items()}

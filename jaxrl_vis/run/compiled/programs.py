@@ -2,7 +2,8 @@
 
 All of it is compiled before training starts, so that nothing is compiled at the end of a run, which a signal may have caused.
 
-A training iteration is two programs, ``play`` and ``learn`` (`jaxrl_vis.learner.train_step`), which XLA compiles in parallel.
+A training iteration is ``keys``, which is tiny, and two programs that XLA compiles in parallel, ``play`` and ``learn``
+(`jaxrl_vis.learner.train_step`).
 A CPU also evaluates with ``play``; other devices have a separate program for evaluation.
 """
 
@@ -58,13 +59,13 @@ class Programs:
     """Programs of a configuration. Nothing is compiled or allocated until it is called or `compile` is.
 
     Args:
-        config: The run.
+        config: Configuration of the run.
         program: From `jaxrl_vis.learner.train_step.make_train_step`, or anything with the same attributes.
         keep: Whether to cache traced programs on disk, if permitted (see `trace_cache`); ignored on several devices.
         cache: Whether to cache compiled programs on disk; without, traced ones are not cached either.
 
     Attributes:
-        config: The run.
+        config: Configuration of the run.
         program: The jitted functions and their sizes.
         env: The environment.
         layout: Placement of seeds and shards.

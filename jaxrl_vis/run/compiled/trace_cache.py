@@ -57,7 +57,7 @@ def fingerprint(config: Config, env: GoalEnv, learner: Any = None) -> str | None
     """Compute a hexadecimal digest of everything that a run's programs depend on; None if they must not be cached.
 
     Args:
-        config: The run.
+        config: Configuration of the run.
         env: Its environment.
         learner: Tree of the learner, or of a policy; only its structure counts.
     """
@@ -123,7 +123,7 @@ class TraceCache:
         return jaxrl_vis_envs.jit(program.call, **self._jit_options.get(name, {})).lower(*arguments)
 
     def write(self) -> None:
-        """Store the newly traced programs, after their compilation; skipped if the folder cannot be written."""
+        """Store the newly traced programs, and delete the oldest files beyond `MAX_FILES`; skipped if this is impossible."""
         with contextlib.suppress(OSError):
             make_private(self._folder)
             for name, data in self._fresh.items() if self._is_private() else ():

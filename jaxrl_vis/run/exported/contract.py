@@ -38,7 +38,7 @@ class Contract:
         file: Path of the policy.
         golden: Path of the golden frames.
         forms: Form of ``observation``, ``goal`` and ``action``.
-        values: The whole contract.
+        values: The whole contract, a JSON value.
     """
 
     format: str

@@ -62,6 +62,9 @@ def export_run(
         seed, checkpoint, trust: As in `load_policy`.
         overwrite: Whether to replace an exported policy in ``out``.
 
+    Returns:
+        The result of `check_file` on the written folder.
+
     Raises:
         RequestError: The run cannot be used, the policy does not support the format, a library is missing, or ``out`` is not
             empty.
@@ -114,7 +117,7 @@ def _input_ranges(policy: Policy) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 def _write(
     folder: Path, kind: str, policy: Policy, layers: Layers | None, frames: golden.Golden, contract: dict[str, Any]
 ) -> None:
-    """Write the files, the contract last, so that an interrupted export has no contract.
+    """Write the files, the contract last, so that an interrupted export has no contract. ``layers`` is None for StableHLO.
 
     Raises:
         StorageError: A file cannot be written.

@@ -55,6 +55,9 @@ def to_bytes(layers: Layers, shape: tuple[int, ...], dtype: np.dtype, about: str
         layers: The policy.
         shape, dtype: Shape and dtype of an observation.
         about: Description stored in the model.
+
+    Raises:
+        RequestError: onnx or onnxruntime is missing.
     """
     onnx, _ = require()
     helper, graph = onnx.helper, _Graph(onnx)

@@ -19,7 +19,7 @@ def format_fractions(values: Sequence[float]) -> str:
 
 
 def format_seconds(seconds: float) -> str:
-    """Format a duration as ``42 s``, ``3 min 5 s`` or ``2 h 10 min``."""
+    """Format a duration in seconds as ``4.2 s``, ``42 s``, ``3 min 5 s`` or ``2 h 10 min``."""
     rounded = round(seconds)
     if rounded < 60:
         return f"{seconds:.1f} s" if seconds < 10 else f"{rounded} s"

@@ -43,7 +43,7 @@ class Logger(Protocol):
         """Log rows of metrics.jsonl."""
 
     def image(self, name: str, file: Path, env_steps: int) -> None:
-        """Log a .png or .gif drawn after ``env_steps`` steps."""
+        """Log the image ``file``, a .png or .gif drawn after ``env_steps`` steps, as ``name``."""
 
     def close(self) -> None:
         """Wait until everything is delivered."""

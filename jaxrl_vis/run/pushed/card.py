@@ -55,7 +55,7 @@ def card(
         seed: Seed whose weights are in the folder.
         scores: Scores by seed; empty if none was evaluated at the iteration of the weights.
         unit: Unit of distances.
-        pictures: Image files by caption.
+        pictures: Image files by caption; None for no images.
         shipped_name: Name of the policy if it ships with the package; None if the folder stands alone, with metrics.jsonl.
         remark: Additional sentence about the scores.
     """

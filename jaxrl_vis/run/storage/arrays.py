@@ -52,14 +52,17 @@ def _checksum(array: np.ndarray) -> int:
 
 
 def describe(arrays: dict[str, Any]) -> dict[str, list]:
-    """Describe arrays for a manifest: shape, dtype and checksum, by name."""
+    """Describe arrays for a manifest, by name: [shape, dtype, checksum]; with several processes see `_describe_parts`."""
     if distributed.is_multi_process():
         return _describe_parts(arrays)
     return {name: [list(array.shape), str(array.dtype), _checksum(array)] for name, array in arrays.items()}
 
 
 def saved_leaves(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
-    """Return the leaves of a pytree by name, as saved by orbax; with several processes, each writes its own parts."""
+    """Return the leaves of a pytree by name, as saved by orbax: the arrays of `to_host`.
+
+    With several processes, these are the arrays on devices instead, of which each process writes its own shards.
+    """
     if not distributed.is_multi_process():
         return to_host(tree, copy)
     return {
@@ -69,7 +72,10 @@ def saved_leaves(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
 
 
 def _describe_parts(arrays: dict[str, jax.Array]) -> dict[str, list]:
-    """Describe arrays distributed over processes; the last number is the count of axes for `_row_checksum`."""
+    """Describe arrays distributed over processes, by name: [shape, dtype, checksum, ``axes`` of `_row_checksum`].
+
+    A collective call: each process adds up the checksums of its own shards, and the manifest has the total.
+    """
     axes = {
         name: max((n + 1 for n, on in enumerate(_partition_spec(array)) if on), default=0) for name, array in arrays.items()
     }

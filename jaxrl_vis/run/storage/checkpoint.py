@@ -8,7 +8,8 @@
 Each checkpoint has a manifest: names, shapes, dtypes and checksums of all arrays, and the host's progress. orbax makes a folder
 appear under its final name only when it is complete; the checksums detect later damage, such as a flipped byte, which would
 otherwise be restored silently. After the background write, SHA256SUMS (`sums`) is added for `verification`, also of data that
-is never restored. The newest two light ones and the newest two full ones are kept.
+is never restored. The newest two light and the newest two full checkpoints are kept; without a ``full_checkpoint_interval``, a
+full one (written on interruption) is deleted once a newer light one is on the disk, see `Checkpoints.retire_full`.
 
 A run resumes from the newest valid full, recent or light checkpoint; ties are broken in this order. Checkpoints newer than the
 one resumed from are never deleted: damaged ones are moved to checkpoints/damaged/, and those of another run, identified by
@@ -60,8 +61,8 @@ class Checkpoints:
         read_only: Whether to only read: nothing is saved, created or cleaned up.
 
     Attributes:
-        run_id: Id of the run: other runs' checkpoints are ignored, except by
-            `set_foreign_aside`. `ANY_RUN`: all checkpoints.
+        run_id: Id of the run: other runs' checkpoints are ignored, except by `set_foreign_aside`. `ANY_RUN`: all checkpoints.
+        recent: Recent states of the run.
     """
 
     def __init__(
@@ -135,7 +136,7 @@ class Checkpoints:
         return self.run_id in (ANY_RUN, manifest.get(RUN_ID))
 
     def newest(self) -> int | None:
-        """Return the newest iteration from which the run could resume; None if there is none."""
+        """Return the iteration of the newest full, recent or light checkpoint, even if damaged; None if there is none."""
         return max((iteration for tier in _PRECEDENCE for iteration in self.iterations(tier)), default=None)
 
     def save_light(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
@@ -145,11 +146,14 @@ class Checkpoints:
             iteration: Iterations completed.
             train: The learner, [S, ...].
             progress: A JSON value.
+
+        Raises:
+            StorageError: It cannot be written, or an earlier light checkpoint could not.
         """
         self._save(LIGHT, iteration, {"train": saved_leaves(train, copy=True)}, progress)
 
     def save_best(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
-        """Write the learner, wait for the disk, then delete the previous best checkpoint. See `save_light`."""
+        """Write the learner, wait for the disk, then delete earlier best checkpoints. Otherwise as `save_light`."""
         self._save(BEST, iteration, {"train": saved_leaves(train, copy=False)}, progress)
         self.wait()
         for earlier in self.iterations(BEST):
@@ -159,7 +163,10 @@ class Checkpoints:
                     shutil.rmtree(self._folder / BEST / str(earlier), ignore_errors=True)
 
     def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
-        """Write the complete state and wait for the disk: an asynchronous copy of the replay would need memory for two."""
+        """Write the complete state and wait for the disk: an asynchronous copy of the replay would need memory for two.
+
+        Otherwise as `save_light`.
+        """
         items = {
             "train": saved_leaves(loop.train, copy=False),
             "rest": saved_leaves(state_without_learner(loop), copy=False),
@@ -325,11 +332,14 @@ class Checkpoints:
         return self._newest_good(template, with_replay=True)
 
     def restore_train(self, template: LoopState, iteration: int | None = None) -> Restored | None:
-        """Restore the learner of the newest valid light or full checkpoint, or of ``iteration``; see `restore_for_resume`."""
+        """Restore the learner of the newest valid light or full checkpoint, or of that of ``iteration``; None if there is none.
+
+        Otherwise as `restore_for_resume`.
+        """
         return self._newest_good(template, with_replay=False, requested=iteration)
 
     def manifest(self, tier: str, iteration: int) -> dict[str, Any]:
-        """Return the manifest of a checkpoint: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
+        """Return a checkpoint's manifest: ``schema``, ``run_id``, ``iteration``, ``items`` (`arrays.describe`), ``progress``.
 
         Raises:
             RequestError: The checkpoint is damaged, or of another schema.
@@ -338,7 +348,7 @@ class Checkpoints:
             return self._read_manifest(tier, iteration)
 
     def restore(self, tier: str, manifest: dict[str, Any], template: LoopState) -> Restored:
-        """Restore one checkpoint completely, and compare it with the checksums in its manifest.
+        """Restore a light, best or full checkpoint completely, and compare it with the checksums in its manifest.
 
         Raises:
             RequestError: The checkpoint is damaged, or has another structure.

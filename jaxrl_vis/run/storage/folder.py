@@ -31,7 +31,7 @@ from jaxrl_vis.run.storage.metrics import RUN_ID, read_rows
 SCHEMA = 2
 
 CHECKPOINT_FOLDERS = ("light", "full", "best", "recent", "damaged", "replaced")
-"""Subfolders written by `checkpoint`."""
+"""Subfolders of checkpoints/ that are deleted with their run; foreign/, with those of other runs, is kept."""
 
 _UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written
 
@@ -280,7 +280,13 @@ def _is_remainder(checkpoint: Path, run_id: str) -> bool:
 
 
 def _where_gone(path: Path, current: Path | None, when: str) -> str:
-    """Return a message about a run folder that is not in place."""
+    """Return a message about a run folder that is not in place.
+
+    Args:
+        path: The folder's path when it was locked.
+        current: Its current path; None if it was deleted, or the path is unknown.
+        when: Time of the loss, for the message.
+    """
     if current is None:
         return f"{path} is gone: it was deleted, or moved away, {when}"
     is_there = current == path.resolve()

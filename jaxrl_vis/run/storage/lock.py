@@ -239,7 +239,7 @@ def _read(path: Path) -> str:
 
 
 def _owner(text: str) -> tuple[str, int] | None:
-    """Parse host and process from a lock file of either form."""
+    """Parse host and process from a lock file of either form; None if it has another form."""
     with contextlib.suppress(ValueError, KeyError, TypeError):
         if not text.startswith(_MARKER):
             record = json.loads(text)

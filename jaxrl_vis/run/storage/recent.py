@@ -84,7 +84,7 @@ class Recent:
             return True
 
     def set_foreign_aside(self, to: Path) -> bool:
-        """Move all files aside if one is a state of another run; return True if so."""
+        """Move the folder with all states to ``to`` if one of them is of another run; return True if so."""
         is_foreign = any(not self._is_ours(iteration) for iteration in _numbers(self._folder, "state"))
         if is_foreign:
             to.parent.mkdir(exist_ok=True)

@@ -27,7 +27,7 @@ def score(config: Config, values: Mapping[str, Sequence[float]]) -> float:
     """Return the score of an evaluation.
 
     Args:
-        config: The run.
+        config: Configuration of the run.
         values: ``eval/*``, one number per seed.
     """
     per_seed = values[f"eval/{metric_name(config)}"]
@@ -53,7 +53,7 @@ def enough_at(config: Config, rows: Sequence[Mapping[str, Any]], seeds: Collecti
     """Return the iterations, ascending, after whose evaluations the run could have stopped.
 
     Args:
-        config: The run.
+        config: Configuration of the run.
         rows: Rows of metrics.jsonl.
         seeds: Seeds of the run; evaluations without rows of all of them are ignored.
     """

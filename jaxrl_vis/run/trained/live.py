@@ -51,9 +51,9 @@ class Session:
 
     Attributes:
         state: State of the environment.
-        observation: Last observation, the policy's input.
+        observation: Last observation, the policy's input: [C, H, W] uint8 or [S] float32.
         goal: Goal, in the same form.
-        goal_data: Poses of the robot at its goal.
+        goal_data: `mjx.Data` of the robot at its goal.
 
     Raises:
         RequestError: The task has no poses to be shown.

@@ -30,7 +30,7 @@ def play_auxiliary(
     """Roll out the first seed of a run's checkpoint, and write a video of episodes and auxiliary predictions.
 
     Observation, goal, reconstruction, true and predicted optical flow, and the rotated image with its angle are shown side by
-    side, as far as the run has the tasks. Predictions are those of the critic's heads.
+    side, as far as the run has the tasks. Predictions are those of the critic's heads, with ``critic_states`` of the actor's.
 
     Args:
         run_dir: The run folder.

@@ -96,7 +96,7 @@ def _source(folder: Path, about: dict[str, Any]) -> Source:
 
 
 def read(folder: Path, trainer: Trainer) -> tuple[TrainState, Source]:
-    """Read a policy and its origin; the policy as a learner of one seed whose agent consists of the policy's parameters.
+    """Read a policy as a learner of one seed, whose agent consists of the policy's parameters; return it and its origin.
 
     Args:
         folder: Folder written by `write`.

@@ -29,7 +29,7 @@ class Results:
         programs: Programs of the run.
         folder: Folder of the files.
         loggers: Loggers that also receive the images.
-        echo: Prints a line.
+        echo: Called with each line of the summary.
     """
 
     def __init__(self, programs: Programs, folder: RunFolder, loggers: Loggers, echo: Callable[[str], None]):
@@ -41,7 +41,7 @@ class Results:
         Args:
             done: Iterations completed.
             progress_now: Returns the current progress.
-            recorded: Images of the last evaluation, see `evaluate.make_evaluate`; unused if there are none.
+            recorded: Images of the last evaluation, see `evaluate.make_evaluate`; unused if observations are not images.
         """
         self.draw_curve(done)
         if self._programs.shows_images:

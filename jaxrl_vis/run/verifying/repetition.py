@@ -85,7 +85,7 @@ class Repeater:
     def repeat(
         self, name: str, first_iteration: int, progress: Progress, loop: LoopState, compared_iterations: Sequence[int]
     ) -> None:
-        """Repeat iterations and compare the results.
+        """Repeat iterations and compare the results; ends early, with a difference, at a non-finite number.
 
         Args:
             name: Name of the starting point, for messages.

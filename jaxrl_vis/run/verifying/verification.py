@@ -180,7 +180,7 @@ class _Verifier:
         )
 
     def _is_there(self, tier: str, number: int) -> bool:
-        """Return True if a checkpoint still exists: the run itself deletes all but the newest two."""
+        """Return True if a checkpoint still exists: a run in progress deletes old ones."""
         return (self._folder.checkpoints / tier / str(number)).is_dir()
 
     def _read_manifests(self) -> None:

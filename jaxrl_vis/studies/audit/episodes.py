@@ -26,9 +26,9 @@ class Episodes(NamedTuple):
     """E episodes of T steps.
 
     Attributes:
-        images: [E, T+1, ...] observations.
+        images: [E, T+1, C, H, W] uint8, observations.
         states: [E, T+1, G] float32, true states.
-        goals: [E, ...] goal images that were given.
+        goals: [E, C, H, W] uint8, goal images that were given.
         goal_states: [E, G] float32, true states of these goals.
     """
 
@@ -42,7 +42,7 @@ class Pairs(NamedTuple):
     """N pairs of an image and a goal image.
 
     Attributes:
-        images, goals: [N, ...].
+        images, goals: [N, C, H, W] uint8.
         distance: [N] float32, true distance, in the task's unit.
     """
 
@@ -77,7 +77,7 @@ def _actions(key: jax.Array, horizon: int, size: int) -> jax.Array:
 
 
 def play(env: GoalEnv, count: int, seed: int) -> Episodes:
-    """Roll out E = ``count`` episodes of slowly changing random actions; return NumPy arrays."""
+    """Roll out E = ``count`` episodes of slowly changing random actions, determined by ``seed``; return NumPy arrays."""
 
     def episode(key: jax.Array) -> Episodes:
         start_key, action_key = jax.random.split(key)
@@ -118,7 +118,8 @@ def with_noise(pairs: Pairs, deviation: float, seed: int) -> Pairs:
 def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:
     """Pair every image but the first with the last image of its episode, that of another episode, and the given goal.
 
-    The 3 E T pairs are in this order of goals; for each of them, episode by episode. ``seed`` determines the other episodes.
+    The 3 E T pairs are in this order of goals; for each of them, episode by episode. ``seed`` determines the other
+    episodes. If there is only one episode, it is also the other one.
     """
     count, length = episodes.images.shape[0], env.horizon
     draw = np.random.default_rng(seed)
@@ -134,7 +135,15 @@ def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:
 
 
 def search(env: GoalEnv, reward: Reward, goals: int, sequences: int, seed: int) -> SearchResult:
-    """Search for actions that maximise a reward at the end of an episode, ``sequences`` random ones for each of ``goals``."""
+    """Search for actions that maximise a reward at the end of an episode; return NumPy arrays.
+
+    Args:
+        env: Environment of the task.
+        reward: Reward to maximise.
+        goals: E, number of goals, each with a start of its own.
+        sequences: Number of random sequences of actions for each goal.
+        seed: Seed of goals, starts and actions.
+    """
 
     def of_goal(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         start_key, action_key = jax.random.split(key)

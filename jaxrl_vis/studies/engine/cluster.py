@@ -104,10 +104,10 @@ class Job:
         self._job.cancel()
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for the job to end.
+        """Wait for the job to end, and return its exit status.
 
         Raises:
-            subprocess.TimeoutExpired: The job has not ended after ``timeout`` seconds.
+            subprocess.TimeoutExpired: The job has not ended after ``timeout`` seconds, if that is not None.
         """
         end = None if timeout is None else time.monotonic() + timeout
         while self.poll() is None:

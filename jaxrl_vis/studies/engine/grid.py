@@ -43,7 +43,10 @@ Start = Callable[[Sequence[str], Path, Mapping[str, str]], subprocess.Popen | Jo
 
 
 def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> subprocess.Popen:
-    """Start a command on this machine, appending its output to ``log``. See `cluster` for other machines."""
+    """Start a command on this machine with the variables of ``environment`` added, appending its output to ``log``.
+
+    See `cluster` for other machines.
+    """
     # In its own session, so that a Ctrl-C of the terminal reaches it only once, from here: a second signal would end it at
     # once.
     with log.open("a", encoding="utf-8") as file:
@@ -80,7 +83,8 @@ def run_cells(
     """Train unfinished cells; resume those already started.
 
     Args:
-        cells: Cells to train: longest first, so that devices finish at about the same time, otherwise in this order.
+        cells: Cells to train; the longest are started first, so that devices finish at about the same time, and equally long
+            ones in this order.
         runs: Folder of the run folders.
         find_devices: Function that returns the devices, each of which runs one process at a time; called only if there are
             unfinished cells.

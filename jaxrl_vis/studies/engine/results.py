@@ -55,7 +55,7 @@ class Line:
         return self.end / max(1, max(row["updates"] for row in self.rows))
 
     def values(self, metric: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return env_steps [P] and the metric [S, P]."""
+        """Return env_steps [P], ascending, and the metric [S, P]; NaN for missing values."""
         return gather(self.rows, metric)
 
     def has_lost_replay(self) -> bool:
@@ -159,7 +159,7 @@ def mean_success(line: Line, up_to: int) -> float:
 
 
 def final_quartiles(line: Line, metric: str = SUCCESS) -> tuple[float, float, float]:
-    """Compute quartiles over seeds of a metric at the end: 25 %, median, 75 %."""
+    """Compute quartiles over seeds of a metric at the last evaluation: 25 %, median, 75 %."""
     values = [row[metric] for row in line.rows if row["env_steps"] == line.end and row.get(metric) is not None]
     return _quartiles(values)
 

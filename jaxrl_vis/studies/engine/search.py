@@ -125,6 +125,10 @@ def run_search(
 ) -> bool:
     """Train the requested number of trials, one per device at a time, and print the best.
 
+    Args:
+        request: The request.
+        echo, find_devices, command: See `run_cells`.
+
     Returns:
         True if all trials have ended.
 

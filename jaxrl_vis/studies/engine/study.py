@@ -104,6 +104,12 @@ _DEFAULT_BUDGET = 1_500_000  # environment steps of a task without a budget in t
 def make_cells(study: Study, tasks: Sequence[str], variants: Sequence[str], scope: Scope) -> Cells:
     """Create the cells of a study, task by task.
 
+    Args:
+        study: The study.
+        tasks: Environments, from its family's tasks.
+        variants: Names of variants of its family.
+        scope: Scope of the runs.
+
     Raises:
         RequestError: A task or variant is unknown, or a configuration is invalid.
     """

@@ -111,7 +111,7 @@ def _mean(line: Line, metric: str) -> float:
 
 
 def _last(line: Line, metric: str) -> float:
-    """Return the last value of a metric, in the median over seeds; NaN if it was not logged."""
+    """Return the metric at the last evaluation, in the median over seeds; NaN if it was not logged there."""
     values = line.values(metric)[1][:, -1]
     return float(np.median(values[np.isfinite(values)])) if np.isfinite(values).any() else float("nan")
 

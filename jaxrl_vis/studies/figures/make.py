@@ -1,6 +1,6 @@
 """Creation of figures: training of missing runs, plots and tables.
 
-FIGURE.png   lines of finished cells; in figures 5.4 to 5.7 also those released by the authors, dashed
+FIGURE.png   lines of finished cells; in figures 5.4, 5.5 and 5.7 also those released by the authors, dashed
 FIGURE.md    tables, and a description of the runs
 FIGURE.csv   the same numbers, for further processing
 

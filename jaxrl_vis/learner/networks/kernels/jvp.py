@@ -57,7 +57,7 @@ def _layer_jvp(
     kernel_along: jax.Array,
     bias_along: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Compute `layer` and its tangent, given tangents of the values (None for zero), kernel and bias."""
+    """Return the result of `layer` and its tangent, given tangents of the values (None for zero), kernel and bias."""
     out, change = layer(values, kernel, bias), dot(values, kernel_along) + bias_along[None, :]
     if tangents is not None:
         change += dot(tangents, kernel)

@@ -94,7 +94,10 @@ def dot(left: jax.Array, right: jax.Array, contract: tuple[int, int] = (1, 0)) -
 
 
 def layer(values: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
-    """Apply a dense layer with rectifier: [R, inputs] -> [R, outputs], in the dtype of ``values``."""
+    """Apply a dense layer with rectifier: [R, inputs] -> [R, outputs], in the dtype of ``values``.
+
+    ``kernel`` is [inputs, outputs], ``bias`` [outputs].
+    """
     return relu(dot(values, kernel) + bias[None, :]).astype(values.dtype)
 
 
@@ -118,7 +121,7 @@ def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
 
 
 def layer_inputs(values: jax.Array, level: int) -> jax.Array:
-    """Return the rows that layer ``level`` multiplies: four quarters side by side for the last of them, else unchanged."""
+    """Return the rows that layer ``level`` multiplies: for the last layer [4 R, F] -> [R, 4 F], else unchanged."""
     return values.reshape(values.shape[0] // 4, -1) if level == LEVELS - 1 else values
 
 
