@@ -121,7 +121,7 @@ def test_blocks_have_a_language_and_marks_are_true(page: Path) -> None:
 
 
 def save_file(block: Block) -> bool:
-    """Writes a block that begins with `# file: name` to that file; whether it is one."""
+    """Writes a block that begins with `# file: name` to that file; returns True if it did."""
     file = re.match(r"# file: (\S+)\n", block.text)
     if file:
         Path(file[1]).write_text(block.text)

@@ -50,7 +50,7 @@ class Topics:
 
 
 def is_recording(path: Path) -> bool:
-    """Return whether a path is a recording: a file with the suffix of a bag, or the folder of a ROS 2 bag."""
+    """Return True if a path is a recording: a file with the suffix of a bag, or the folder of a ROS 2 bag."""
     if path.is_file():
         return path.suffix.lower() in _SUFFIXES
     about = path / "metadata.yaml"

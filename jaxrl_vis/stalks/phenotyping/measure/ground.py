@@ -88,7 +88,7 @@ def find_ground(
         left, right: Rectified greyscale images [H, W], uint8 or float32.
         calibration: Calibration of the cameras, for images of this size.
         disparity: Known disparities [H, W] float32 to use instead of matching, pixels; NaN where unknown. None to match.
-        depths: Minimum and maximum depth of matched windows, m.
+        depths: Minimum and maximum depth of matched windows, m; unused with ``disparity``.
     """
     frame = find_frame(left)
     part = (slice(*frame.lines), slice(*frame.columns))

@@ -82,6 +82,8 @@ def plot_rows(
 ) -> tuple[list[Row], Row]:
     """Compute the rows of the counted stalks of one plot, in the order of ``tracks``, and the plot's own row.
 
+    Values are text or integers, and empty text if unknown.
+
     Args:
         frames: Sightings of each pair.
         tracks: Tracks of the plot; only counted ones give rows.

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 Annotation = dict[str, Any]
-"""``name``, ``source``, and ``bbox`` and ``segmentation`` as in COCO; or ``problem``: why the shape cannot be a stalk."""
+"""Annotation of one shape by key: label ``name``, ``source`` (for messages), ``group`` (see `merge_groups`), and ``bbox`` and
+``segmentation`` as in COCO; or, instead of these two, ``problem``: reason why the shape cannot be a stalk."""
 
 
 @dataclasses.dataclass
@@ -15,7 +16,7 @@ class Annotated:
     """An image with its annotations.
 
     Attributes:
-        name: Name of the image file, as written in the annotations.
+        name: Name of the image file, as written in the annotations; if `gather` found the file, its path in the folder.
         width, height: Size in pixels; None if the annotations do not state it.
         source: The annotation file.
         annotations: Annotations of the image.
