@@ -129,7 +129,7 @@ def save_file(block: Block) -> bool:
 
 
 def run_block(page: Path, block: Block, names: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
-    """Execute a block in the namespace ``names``, and check prints against their comments (`# (...)`, `# [...]`, `# about 1.0`)."""
+    """Execute a block in the namespace ``names``, and check prints against comments (`# (...)`, `# [...]`, `# about 1.0`)."""
     capsys.readouterr()
     if save_file(block):
         return
