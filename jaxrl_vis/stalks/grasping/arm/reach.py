@@ -99,7 +99,13 @@ class Reaching(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """Constants of one arm's reach: shapes of its stalks, wind, and solution of the inverse kinematics (1 or -1)."""
+    """Constants of one arm's reach.
+
+    Attributes:
+        shape: Shapes of its stalks.
+        gusts: Wind.
+        side: [] float32, solution of the inverse kinematics, 1 or -1.
+    """
 
     shape: Shape
     gusts: Gusts

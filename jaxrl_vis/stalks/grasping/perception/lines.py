@@ -74,7 +74,13 @@ _APART_BESIDE = 0.008  # m: minimum median distance of such chords
 
 
 class _Line(NamedTuple):
-    """Grasp point of a line, indices of its chords, and number of places at which pairs show it."""
+    """Line that is accepted as a stalk.
+
+    Attributes:
+        point: Grasp point.
+        members: [K] int, indices of its chords.
+        shown: Number of places along the line at which pairs show it, summed over pairs.
+    """
 
     point: GraspPoint
     members: np.ndarray

@@ -43,7 +43,11 @@ _MAX_LISTED = 8
 
 @dataclasses.dataclass(frozen=True)
 class Topics:
-    """Topics of the left and right images."""
+    """Topics of a stereo pair of images.
+
+    Attributes:
+        left, right: Names of the topics, such as /stereo/left/image_rect.
+    """
 
     left: str
     right: str

@@ -66,7 +66,7 @@ class Ground:
 
 
 def band_lines(ground: Ground | None, calibration: Calibration, distance: float, column: float) -> tuple[float, float]:
-    """Return the first and last row of the band in a column of the left image, for stalks at a ``distance`` in m.
+    """Return the first and last image row of the band in a column of the left image, for stalks at a ``distance`` in m.
 
     Without a ground plane, cameras are assumed to be level and at their usual height.
     """

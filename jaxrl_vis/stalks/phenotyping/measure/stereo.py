@@ -134,7 +134,12 @@ def match_rows(
 
 @dataclasses.dataclass(frozen=True)
 class _Window:
-    """Window of a stalk: its centre row, first column, and end column (exclusive)."""
+    """Window of a stalk in the left image.
+
+    Attributes:
+        line: Centre row.
+        first, last: First column, and end of the columns (exclusive).
+    """
 
     line: int
     first: int

@@ -70,7 +70,13 @@ UNFAMILIAR = "unlike what the networks know"
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """Values common to all rows of a plot: its name, the method of the widths, and the software version."""
+    """Values common to all rows of a plot.
+
+    Attributes:
+        plot: Name of the plot.
+        method: Method of measuring widths.
+        version: Version of the software.
+    """
 
     plot: str
     method: str

@@ -33,7 +33,10 @@ _NO_WIDTH = "which has no width: draw it as a polygon or a rectangle"
 
 
 def from_outline(name: str, points: np.ndarray, source: str, group: Any = None) -> Annotation:
-    """Return a polygon annotation with corners [N, 2] in pixels and their bounding box; nothing is checked."""
+    """Return a polygon annotation with corners [N, 2] in pixels and their bounding box; nothing is checked.
+
+    ``source`` names it in messages; polygons with the same ``group`` are merged by `merge_groups`, None for none.
+    """
     low, high = points.min(axis=0), points.max(axis=0)
     with np.errstate(over="ignore", invalid="ignore"):
         box = [*map(float, low), *map(float, high - low)]
