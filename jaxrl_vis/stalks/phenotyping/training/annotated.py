@@ -136,8 +136,8 @@ def _resolutions(folder: Path, images: list[dict[str, Any]]) -> dict[int, float 
 def fit_settings(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
     """Return settings adapted to the boxes of a folder's annotations.
 
-    Stalk crops become at least twice as wide as the median box. Without sections, anchors become as tall as the median box,
-    with widths at quantiles of those of the boxes.
+    Stalk crops become at least twice as wide as the median box, up to 512 pixels. Without sections, anchors become as tall as
+    the median box, with widths at quantiles of those of the boxes.
 
     If the folder has no calibration, images are resized so that boxes are as tall as the band, or stalks as wide as those of
     training with sections; detection with networks trained on them uses the same resizing. Stalk crops are scaled accordingly.

@@ -64,7 +64,7 @@ def augment_geometry(
     Returns:
         Images, black where the originals did not reach; stalks; and kinds. Shapes and dtypes are those of the arguments. Boxes
         are clipped to the image, and become ``NOTHING`` if hardly anything is left. Edges are not clipped, and their kinds are
-        unchanged: rows that leave the image become `ABSENT`, those that leave it in part at most `UNKNOWN`.
+        unchanged: rows that leave the image become `ABSENT`, those of which less than `WHOLE` is left at most `UNKNOWN`.
     """
     keys = jax.random.split(key, images.shape[0])
     return jax.vmap(_transform_stalks)(images, stalks, kinds, sizes, keys)

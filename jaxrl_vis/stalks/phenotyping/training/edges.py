@@ -24,7 +24,7 @@ Edges = tuple[np.ndarray, np.ndarray]
 def synthetic_edges(
     plot: Plot, pose: Pose, camera: Calibration, instance: np.ndarray, shape: tuple[int, int], scale: tuple[float, float]
 ) -> Edges:
-    """Compute the edges of the visible stalks of an image; those of which hardly a pixel is left after resizing are dropped.
+    """Compute the edges of the visible stalks of an image; those with fewer than 12 pixels after resizing are dropped.
 
     By day, stalks of the rows of plants behind look like those of the near row: they are ``UNCLEAR``. At night, they are
     background, as the light of the flash falls off.
@@ -73,7 +73,7 @@ def _sides(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return the left and right columns [R] of a stalk at image rows ``lines`` [R], and a mask [R] of the rows that it reaches.
 
-    Beyond its ends, columns are extrapolated. None if it is nearer than `_NEAR` or less than two pixels tall.
+    Beyond its ends, columns are extrapolated. None if all of it is nearer than `_NEAR`, or less than two pixels tall.
     """
     heights = np.linspace(0.0, stalk.points[:, 2].max(), _HEIGHTS)
     # A tall stalk that leans over the camera has no projection there.
@@ -121,7 +121,7 @@ def cut_edges(edges: Edges, top: int, left: int, lines: int) -> Edges:
 def stack_edges(edges: Sequence[Edges | None], height: int) -> Edges:
     """Batch the edges of N images padded to ``height`` pixels: edges [N, T, R, 3] and kinds [N, T], T being `MAX_EDGES`.
 
-    An image whose edges are None gets none.
+    Images whose edges are None have no stalks.
     """
     rows = -(-height // STEP)
     batch, kinds = np.zeros((len(edges), MAX_EDGES, rows, 3), np.float32), np.full((len(edges), MAX_EDGES), NOTHING, np.int32)

@@ -111,7 +111,7 @@ def tune(
 
     Returns:
         Result, whose parameters are on the host: those with the best score on the images for early stopping, which may be the
-        initial ones.
+        initial ones, or the last ones without such images.
 
     Raises:
         NonFiniteError: A loss is not finite when it is reported or held-out images are evaluated.
