@@ -1,4 +1,4 @@
-"""Tests run on the CPU, whatever else there is, and compile each program once for all workers and runs."""
+"""Shared fixtures and hooks. Tests run on the CPU and share a persistent compilation cache across workers and runs."""
 
 import gc
 import getpass
@@ -72,7 +72,7 @@ gc.set_threshold(100_000, 20, 20)
 
 @pytest.fixture
 def checkout() -> Path:
-    """The folder that holds pyproject.toml."""
+    """Root folder of the checkout, which holds pyproject.toml."""
     return Path(__file__).resolve().parents[1]
 
 
@@ -84,7 +84,7 @@ def clean_environment(checkout: Path) -> dict[str, str]:
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The current folder, empty; what is imported or registered from it is forgotten after the test."""
+    """Empty current folder; modules imported and environments registered during the test are removed after it."""
     from jaxrl_vis_envs import registry
 
     folder = tmp_path / "here"
@@ -103,7 +103,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def straight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, list]:
-    """A run of the fake program, of eight iterations without interruption: its folder, its trainer, its reports."""
+    """Uninterrupted run of the fake program over eight iterations: its folder, trainer and reports."""
     from fake_program import make_fake_trainer, small_config
 
     path = tmp_path_factory.mktemp("runs") / "straight"
@@ -127,7 +127,7 @@ SHARED = dict.fromkeys(("test_docs", "test_notebooks", "test_resume"), "test_tra
 
 
 def group_of(nodeid: str) -> str:
-    """What shares compiled programs with other tests: those of one task, or else of one file."""
+    """Return the name of the group of tests that share compiled programs: the test's task, or else its file."""
     file = Path(nodeid.partition("::")[0]).stem
     names = [task for task in TASKS if task in nodeid.lower()] if file.removeprefix("test_") in TASK_TESTS else []
     return names[0] if names else SHARED.get(file, file)
@@ -142,7 +142,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _spare_the_collector() -> None:
-    """What is there now (modules, compiled programs) mostly stays: the garbage collector need not look through it each time."""
+    """Exempt present objects (modules, compiled programs), most of which stay, from further garbage collection."""
     gc.collect()
     gc.freeze()
 
@@ -156,7 +156,7 @@ _MANY_MEMORY_MAPPINGS = 20_000
 
 
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """Lets go of compiled programs between groups, in a process that has so many that it would run out of memory mappings."""
+    """Release compiled programs between groups if the process might otherwise run out of memory mappings."""
     if nextitem is None or item.path == nextitem.path:
         return
     mappings = Path("/proc/self/maps")
@@ -169,7 +169,7 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Each group runs in one process."""
+    """Return a scheduler that runs each group of tests in one process."""
     from xdist.scheduler import LoadScopeScheduling
 
     class OneProcessPerGroup(LoadScopeScheduling):

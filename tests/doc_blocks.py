@@ -1,4 +1,4 @@
-"""Reads the code of the README and of docs/: which blocks there are, and whether a line of a shell block could be typed."""
+"""Extraction of the code blocks of the README and docs/, and checks of the commands in their shell blocks."""
 
 import importlib.util
 import re
@@ -16,7 +16,7 @@ PROGRAMS = {"cd", "git", "jaxrl-vis", "make", "pip", "python", "source", "uv"}
 
 
 class Block(NamedTuple):
-    """A block of code: its language ("" for a drawing), the line it begins in, and its text."""
+    """Block of code: its language ("" for a drawing), the number of its first line in the page, and its text."""
 
     language: str
     line: int
@@ -24,13 +24,13 @@ class Block(NamedTuple):
 
     @property
     def mark(self) -> str:
-        """The words of a first line `# needs ...` or `# after ...`, which say why the block cannot be tried as it stands."""
+        """Text of a first line `# needs ...` or `# after ...`, the reason why the block cannot run as it is; empty if none."""
         found = re.match(r"# ((?:needs|after) .*)\n", self.text)
         return found[1] if found else ""
 
 
 def blocks(page: Path) -> list[Block]:
-    """The blocks of a page: fenced, or indented by four after an empty line."""
+    """Return the code blocks of a page: fenced, or indented by four spaces after an empty line."""
     found, lines = [], [*page.read_text().splitlines(), ""]
     fence, start, inside = None, 0, []
     for number, line in enumerate(lines, 1):
@@ -54,12 +54,12 @@ def blocks(page: Path) -> list[Block]:
 
 
 def pages_with(language: str) -> list[Path]:
-    """Pages that have blocks of a language."""
+    """Return the pages that contain blocks of a language."""
     return [page for page in PAGES if any(block.language == language for block in blocks(page))]
 
 
 def commands(block: Block) -> Iterator[list[str]]:
-    """The words of each command of a shell block, without comments, and without what is set before it (`NAME=value`)."""
+    """Yield the words of each command of a shell block, without comments and preceding assignments (`NAME=value`)."""
     for line in block.text.replace("\\\n", " ").splitlines():
         for part in shlex.join(shlex.split(line.replace("<", "'<").replace(">", ">'"), comments=True)).split("'&&'"):
             words = shlex.split(part)
@@ -70,7 +70,7 @@ def commands(block: Block) -> Iterator[list[str]]:
 
 
 def check_other(words: list[str]) -> None:
-    """Checks a command that is not `jaxrl-vis`: that what it names is there."""
+    """Check that the targets, extras, modules, scripts and options named by a command other than `jaxrl-vis` exist."""
     program, *rest = words
     assert program in PROGRAMS, f"{program}: say here how to check it"
     if program == "make":

@@ -1,6 +1,6 @@
-"""A program with the interface of `train_step.TrainStep` that compiles in a moment: it draws random numbers and "learns" them.
+"""Fake program with the interface of `train_step.TrainStep` that compiles quickly: it "learns" from random numbers.
 
-As a script (`python fake_program.py RUN_DIR KIND`), it trains until somebody stops it; the tests send it signals.
+As a script (`python fake_program.py RUN_DIR KIND`), it trains until it is stopped; the tests send it signals.
 """
 
 import collections
@@ -46,7 +46,7 @@ def small_config(**changes) -> Config:
 
 @dataclasses.dataclass(frozen=True)
 class _Sizes:
-    """What the jitted functions of a `FakeProgram` depend on."""
+    """Values that the jitted functions of a `FakeProgram` depend on."""
 
     image: int
     num_envs: int
@@ -75,7 +75,7 @@ def _make_env(image_size: int) -> types.SimpleNamespace:
 
 
 class FakeProgram:
-    """See the module. Functions of equal sizes are made, and traced, once a process."""
+    """Fake program, see the module. Programs of equal `_Sizes` share jitted functions, traced once per process."""
 
     def __init__(self, config: Config, nan_at: int | None = None, break_state: bool = False, filtered_share: float = 0.1):
         size, num_envs = config.environment.image_size, config.run.num_envs
@@ -93,13 +93,13 @@ class FakeProgram:
 
     @property
     def traces(self) -> int:
-        """How often this process has traced `learn` of these sizes."""
+        """Number of times that this process has traced `learn` with these sizes."""
         return _TRACES[self._sizes]
 
 
 @functools.cache
 def _jitted(sizes: _Sizes) -> dict[str, Any]:
-    """Make `init`, `keys`, `play`, `learn` and `evaluate`."""
+    """Return the jitted functions `init`, `keys`, `play`, `learn` and `evaluate`, by name."""
     size, episodes = sizes.image, sizes.episodes
     played = part_result_spec(_make_env(size), sizes.num_envs, sizes.seeds)
 
@@ -186,7 +186,7 @@ def make_fake_trainer(
 
 
 def interrupted_at(trainer: Trainer, iteration: int) -> None:
-    """Runs until SIGTERM comes after ``iteration``, and is acted upon."""
+    """Run a trainer, send SIGTERM after ``iteration``, and return once it has stopped; fail if it does not."""
     try:
         for report in trainer.run():
             if report.iteration == iteration:
@@ -209,7 +209,7 @@ def final_state(path: Path, shapes) -> list[np.ndarray]:
 
 
 def as_plain(tree) -> list[np.ndarray]:
-    """All leaves as numpy arrays, keys as their words."""
+    """Return all leaves as NumPy arrays, typed keys as their uint32 data."""
 
     def plain(leaf):
         return np.array(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)

@@ -1,4 +1,4 @@
-"""Learners for tests, of many configurations: what these have in common is compiled once."""
+"""Learners for tests, of many configurations; functions that do not depend on their differences are compiled once."""
 
 import functools
 
@@ -28,7 +28,7 @@ def _without(config, fields):
 
 
 def begin(program, keys):
-    """What ``program.init`` returns for typed keys [S]; programs that start alike share the compiled one."""
+    """Return ``program.init`` of typed keys [S]; programs with the same initialisation share a compiled one."""
     env, start = program.env, _without(program.config, (*_LATER, *_NOT_AT_FIRST))
     of_env = str(env.observation_spec), env.goal_state_size, env.action_size, env.horizon
     return _compiled.setdefault(("init", start, of_env, program.resolved.critic_output_bias), program.init)(keys)
@@ -40,18 +40,18 @@ def _parts(program, play, train, keys):
 
 
 def rollout(program, train, keys):
-    """Episodes [S, E, ...] and outcome of a rollout of training, with typed keys [S]."""
+    """Return episodes [S, E, ...] and outcome of a training rollout with typed keys [S]."""
     parts = _parts(program, program.play, train, keys)
     return jax.tree.map(lambda *leaves: join_parts(leaves, program.config.run.num_envs, axis=1), *parts)
 
 
 def train_iteration(program, loop):
-    """What `Programs.train_iteration` does, by functions that are compiled when they are called; ``loop`` is donated."""
+    """Train for one iteration as `Programs.train_iteration` does, compiling functions when called; ``loop`` is donated."""
     return program.learn(loop, _parts(program, program.play, loop.train, program.keys(loop.key, loop.iteration)))
 
 
 def experienced(program, key):
-    """Arguments of ``program.update_many`` after one rollout, which programs share that differ in their updates only."""
+    """Return arguments for ``program.update_many`` after one rollout; programs that differ only in updates share its code."""
     assert program.config.study.normalizer_source == "rollouts"
     what = type(program.env), _without(program.config, _LATER)
     loop, keys = begin(program, key[None]), key[None]
@@ -63,7 +63,7 @@ def experienced(program, key):
 
 
 class OneOf(probes.Probe):
-    """One of several probes of the same sizes, which a program is told when it runs."""
+    """Environment that is one of several probes of equal sizes, selected by the traced index ``chosen``."""
 
     def __init__(self, several, chosen):
         self.several, self.chosen = several, chosen
@@ -77,7 +77,7 @@ class OneOf(probes.Probe):
 
 @functools.cache
 def iteration_of_one(several, config):
-    """(which one, LoopState) -> what `train_iteration` returns, in one of several probes: one program for all of them."""
+    """Return a function (index of the probe, LoopState) -> `train_iteration`, compiled once for several probes."""
 
     def iterate(chosen, loop):
         program = make_train_step(OneOf(several, chosen), config)

@@ -1,4 +1,4 @@
-"""Makes tests/data/optical_flow.npz: consecutive frames of our tasks, and the optical flow that OpenCV finds between them.
+"""Generate tests/data/optical_flow.npz: consecutive frames of our tasks, and OpenCV's optical flow between them.
 
 Needs opencv-python-headless; the tests that compare with the file do not. Run from the repository root:
 
@@ -7,7 +7,7 @@ Needs opencv-python-headless; the tests that compare with the file do not. Run f
 For every task and image size the file holds, under ``TASK/SIZE``:
 
     grey     [episodes, frames, H, W] uint8, luminance of frames one control step apart, under random actions
-    flow     [episodes, frames - 1, H, W, 2] float16, (right, down) in pixels, of the frames as they are, 0 to 255
+    flow     [episodes, frames - 1, H, W, 2] float16, (right, down) in pixels, of the grey frames
 """
 
 import pathlib
@@ -27,7 +27,7 @@ SETTINGS = (0.5, 3, 15, 3, 5, 1.2, 0)
 
 
 def render(task: str) -> dict[int, np.ndarray]:
-    """Frames [episodes, frames, 3, H, W] uint8 of the same episodes at every size."""
+    """Render frames [episodes, frames, 3, H, W] uint8 of the same episodes at every size; return them by size."""
     envs = {size: jaxrl_vis_envs.make(task, image_size=size, pixels="rgb", frame_stack=1) for size in SIZES}
     env = envs[SIZES[0]]
 
@@ -49,13 +49,13 @@ def render(task: str) -> dict[int, np.ndarray]:
 
 
 def flows(grey: np.ndarray) -> np.ndarray:
-    """OpenCV's flow [episodes, frames - 1, H, W, 2] float32 between neighbours of [episodes, frames, H, W]."""
+    """Compute OpenCV's flow [episodes, frames - 1, H, W, 2] float32 between consecutive frames [episodes, frames, H, W]."""
     pairs = [[(episode[step], episode[step + 1]) for step in range(FRAMES - 1)] for episode in grey]
     return np.array([[cv2.calcOpticalFlowFarneback(*pair, None, *SETTINGS) for pair in episode] for episode in pairs])
 
 
 def main() -> None:
-    """Renders, measures and writes the file."""
+    """Render the frames, compute their flow, and write the file."""
     arrays = {"opencv": np.array(cv2.__version__)}
     for task in TASKS:
         for size, frames in render(task).items():

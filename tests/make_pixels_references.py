@@ -1,9 +1,8 @@
-"""Makes the stored images of MuJoCo's own renderer that images of wrapped environments are compared with. Needs a GL library.
+"""Generate the reference images of MuJoCo's own renderer for wrapped environments. Needs a GL library.
 
     MUJOCO_GL=egl python tests/make_pixels_references.py
 
-Writes tests/data/render/wrapped_NAME.npz for each model of `MODELS`: as the package has it, seen by a camera of its own, after
-random actions.
+Write tests/data/render/NAME.npz for each model of `MODELS`: unchanged, seen by one of its cameras, after random actions.
 """
 
 import dataclasses
@@ -27,14 +26,14 @@ STEPS = 60  # physics steps of random actions before each pose
 
 @dataclasses.dataclass(frozen=True)
 class WrappedModel:
-    """A model of an installed package, and the name of one of its cameras."""
+    """Model file of an installed package, with its path in the package and the name of one of its cameras."""
 
     package: str
     path: str
     camera: str
 
     def load(self) -> mujoco.MjModel:
-        """Reads the model."""
+        """Load the model."""
         return mujoco.MjModel.from_xml_path(str(render_models.package_folder(self.package).joinpath(self.path)))
 
 
@@ -46,7 +45,7 @@ MODELS = {
 
 
 def draw(model: WrappedModel) -> render_references.References:
-    """Draws one model after random actions."""
+    """Render one model in `POSES` poses after random actions."""
     mj_model = model.load()
     # OpenGL draws polygons where a ray caster draws balls, and lights their corners: with fine ones the two mean the same.
     quality = mj_model.vis.quality
@@ -76,7 +75,7 @@ def draw(model: WrappedModel) -> render_references.References:
 
 
 def main() -> None:
-    """Writes the files."""
+    """Write the files."""
     for name, model in MODELS.items():
         print(render_references.save(name, draw(model)))
 

@@ -1,8 +1,8 @@
-"""Makes the stored images of MuJoCo's own renderer that the tests compare ours with. Needs a GL library; the tests do not.
+"""Generate the reference images of MuJoCo's own renderer for our tests. Needs a GL library; the tests do not.
 
     MUJOCO_GL=egl python tests/make_render_references.py [MODEL ...]
 
-Writes tests/data/render/MODEL.npz for each model of render_models.py (all if none is named).
+Write tests/data/render/MODEL.npz for each model of render_models.py (all if none is named).
 """
 
 import argparse
@@ -25,7 +25,7 @@ POSES, HEIGHT, WIDTH = 4, 72, 96
 
 
 def draw(name: str) -> render_references.References:
-    """Draws one model in its first poses."""
+    """Render one model in its first `POSES` poses."""
     mj_model, camera = render_models.build(name)
     truth, _ = render_models.build(name, truth=True)
     mj_data = mujoco.MjData(mj_model)
@@ -44,7 +44,7 @@ def draw(name: str) -> render_references.References:
 
 
 def main() -> None:
-    """Writes the files and says how large they are."""
+    """Write the files and print their sizes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="*", metavar="MODEL")
     for name in parser.parse_args().models or render_models.MODELS:

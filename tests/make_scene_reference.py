@@ -1,10 +1,10 @@
-"""Makes tests/data/render_references.npz: what MuJoCo's own renderer draws, for tests/render/test_render.py to compare with.
+"""Generate tests/data/render_references.npz: images of MuJoCo's own renderer, the reference of tests/render/test_render.py.
 
 Needs a GL library; the test does not. Run from the repository root:
 
     MUJOCO_GL=egl PYTHONPATH=.:envs python tests/make_scene_reference.py
 
-The file holds the model's XML, the poses of every image and the three reference planes, so it explains itself.
+The file holds the model's XML, the poses of every image and the three reference planes, so it is self-contained.
 """
 
 import pathlib
@@ -51,7 +51,7 @@ XML = """
 
 
 def random_poses(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.random.Generator) -> None:
-    """Scatters the movable bodies over the floor and points the camera at the middle of them."""
+    """Scatter the movable bodies over the floor and point the camera at them from a random side, in place."""
     for body in range(1, mj_model.nbody):
         number = mj_model.body_mocapid[body]
         name = mj_model.body(body).name
@@ -73,7 +73,7 @@ def random_poses(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.rando
 
 
 def main() -> None:
-    """Draws the images and writes the file."""
+    """Render the images and write the file."""
     mj_model = mujoco.MjModel.from_xml_string(XML)
     mj_data = mujoco.MjData(mj_model)
     rng = np.random.default_rng(SEED)

@@ -1,4 +1,4 @@
-"""A scene of meshes, a height field and primitives."""
+"""Scene of meshes, a height field and primitives."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -37,7 +37,7 @@ _SCENE = """
 
 
 def spec_of_scene(lens: str, glass: str, more: str) -> mujoco.MjSpec:
-    """Build a scene of primitives and a height field, 40 meshes, one around the near plane, and two that coincide."""
+    """Build a scene of primitives, a height field and 41 meshes, of which one is at the near plane and two coincide."""
     spec = mujoco.MjSpec.from_string(_SCENE.format(lens=lens, glass=glass, more=more))
     rng = np.random.default_rng(0)
     for number in range(4):

@@ -1,7 +1,7 @@
-"""Hypothesis strategies that spoil valid files: their trees, their texts and their bytes.
+"""Hypothesis strategies that corrupt valid files: their trees, texts and bytes.
 
-A document that is spoilt in one place of its tree is still JSON, YAML, TOML or XML, so that what reads it comes past the parser
-to where it looks at names, types and numbers; one that is spoilt as text mostly does not.
+A document whose tree is corrupted is still valid JSON, YAML, TOML or XML, so that its reader gets past the parser to the checks
+of names, types and numbers; one that is corrupted as text mostly does not.
 """
 
 import copy
@@ -16,7 +16,7 @@ import yaml
 from hypothesis import strategies as st
 
 DEEP = 300
-"""Levels of what is put into a tree where it is to be deep; texts are given brackets by the thousand."""
+"""Nesting depth of deep values in trees; texts get up to 3000 brackets."""
 NUMBERS = (0, -1, 1, 2, 7, 0.5, -0.0, 1.5, 1e-320, 1e7, 1e9, -1e9, 1e18, 2**31, 2**63, 10**30, 1e308, -1e308, 10**400)
 WORDS = (
     "",
@@ -47,7 +47,7 @@ def _deep(kind: type) -> Any:
 
 
 def leaves() -> st.SearchStrategy[Any]:
-    """Values that somebody may write where another one is meant."""
+    """Return a strategy for scalars that may stand in a file instead of the intended ones."""
     return st.one_of(
         st.sampled_from(NUMBERS),
         st.integers(-(2**70), 2**70),
@@ -59,13 +59,13 @@ def leaves() -> st.SearchStrategy[Any]:
 
 
 def values() -> st.SearchStrategy[Any]:
-    """`leaves`, and lists and tables, some of them deep or long."""
+    """Return a strategy for `leaves`, lists and tables, some of them deep or long."""
     containers = [[], {}, [[]], [{}], {"": None}, [0] * 12, ["1"] * 4, [0] * 5000, _deep(list), _deep(dict)]
     return st.one_of(leaves(), leaves(), st.sampled_from(containers), st.lists(leaves(), max_size=13))
 
 
 def _places(tree: Any, path: tuple = ()) -> list[tuple]:
-    """Where something stands in a tree: keys and indices from the root."""
+    """Return the paths (keys and indices from the root) of a tree's nodes; of a list's items, only of the first 40."""
     found = [path] if path else []
     if isinstance(tree, dict):
         for key, value in tree.items():
@@ -84,7 +84,7 @@ def _at(tree: Any, path: tuple) -> Any:
 
 @st.composite
 def trees(draw: st.DrawFn, valid: Any, most: int = 3) -> Any:
-    """A valid tree with one to ``most`` nodes replaced, taken away, renamed, doubled or exchanged; now and then as it was."""
+    """Draw a valid tree with 0 to ``most`` nodes replaced, scaled, removed, renamed, duplicated or copied over others."""
     tree = copy.deepcopy(valid)
     for _ in range(draw(st.integers(0, most))):
         places = _places(tree)
@@ -109,17 +109,17 @@ def trees(draw: st.DrawFn, valid: Any, most: int = 3) -> Any:
 
 
 def json_text(tree: Any) -> str:
-    """JSON, lone surrogates and infinities and all."""
+    """Return a tree as JSON, including lone surrogates and infinities."""
     return json.dumps(tree)
 
 
 def yaml_text(tree: Any) -> str:
-    """YAML, as PyYAML writes it, in lines or in brackets."""
+    """Return a tree as YAML as written by PyYAML, with innermost collections in flow style (brackets)."""
     return yaml.safe_dump(tree, default_flow_style=None, allow_unicode=True)
 
 
 def toml_text(tree: Any, name: str = "") -> str:
-    """TOML of a table of tables; what it cannot say is left out."""
+    """Return a table of tables as TOML; values that it cannot express are left out."""
     lines = [f"[{name}]"] if name else []
     tables = []
     for key, value in tree.items() if isinstance(tree, dict) else ():
@@ -146,7 +146,7 @@ def _toml_value(value: Any) -> str | None:
 
 
 def xml_text(tree: Any, name: str) -> str:
-    """XML in which tables are nodes with nodes, lists are as many nodes of one name, and the rest is text."""
+    """Return a tree as XML: tables become nested nodes, lists repeated nodes of one name, and other values text."""
     root = ElementTree.Element(name)
     _fill(root, tree)
     return ElementTree.tostring(root, encoding="unicode")
@@ -208,7 +208,7 @@ _ENCODINGS = ("utf-8", "utf-8-sig", "utf-16", "utf-32", "latin-1", "cp037")
 
 @st.composite
 def texts(draw: st.DrawFn, valid: str) -> bytes:
-    """A valid text with some pieces taken out, doubled or put in, in some encoding."""
+    """Draw a valid text with up to three pieces removed, duplicated or replaced, in some encoding."""
     text = valid
     for _ in range(draw(st.integers(0, 3))):
         begin = draw(st.integers(0, len(text)))
@@ -227,7 +227,10 @@ def texts(draw: st.DrawFn, valid: str) -> bytes:
 
 @st.composite
 def blobs(draw: st.DrawFn, valid: bytes, head: int = 64) -> bytes:
-    """Valid bytes with bits flipped, numbers overwritten (half in the first ``head`` bytes), or pieces doubled or gone."""
+    """Draw valid bytes with bits flipped, numbers overwritten, and pieces duplicated, removed or appended.
+
+    About half of the changes are in the first ``head`` bytes.
+    """
     data = bytearray(valid)
     for _ in range(draw(st.integers(0, 3))):
         if not data:
@@ -254,7 +257,7 @@ def blobs(draw: st.DrawFn, valid: bytes, head: int = 64) -> bytes:
 
 @st.composite
 def pngs(draw: st.DrawFn, valid: bytes) -> bytes:
-    """A PNG with chunks changed, left out or doubled, whose checksums are right."""
+    """Draw a PNG with one chunk changed, removed, duplicated or renamed, and valid checksums."""
     chunks, place = [], 8
     while place < len(valid):
         length = int.from_bytes(valid[place : place + 4], "big")
@@ -275,7 +278,7 @@ def pngs(draw: st.DrawFn, valid: bytes) -> bytes:
 
 @st.composite
 def models(draw: st.DrawFn, valid: str) -> str:
-    """MJCF with attributes changed, exchanged or gone, and elements doubled, moved or gone: most of it loads."""
+    """Draw an MJCF text with attributes changed, added or removed, and elements duplicated or removed; most of them load."""
     root = ElementTree.fromstring(valid)
     for _ in range(draw(st.integers(1, 3))):
         elements = [each for each in root.iter() if each is not root]

@@ -1,4 +1,4 @@
-"""Networks and Adam in NumPy, in float64, with gradients written by hand; they share nothing with the learner."""
+"""Networks and Adam in NumPy, in float64, with hand-written gradients; they share no code with the learner."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ Layers = list[tuple[np.ndarray, np.ndarray]]
 
 
 def layers(head, which=None) -> Layers:
-    """Layers of a head of the learner, as float64; of several heads that lie in one array, that of number ``which``."""
+    """Return the layers of a head of the learner as float64; of stacked heads, those of the head with index ``which``."""
     names = [*sorted(name for name in head if name.startswith("hidden")), "output"]
     pairs = [(head[name]["kernel"], head[name]["bias"]) for name in names]
     pick = (lambda leaf: leaf) if which is None else (lambda leaf: leaf[which])
@@ -15,7 +15,7 @@ def layers(head, which=None) -> Layers:
 
 
 def forward(network: Layers, inputs: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Outputs of a network with rectified hidden layers, and the inputs of each layer."""
+    """Return the outputs [N, outputs] of a network with ReLU hidden layers for inputs [N, inputs], and each layer's inputs."""
     seen, values = [], inputs
     for number, (kernel, bias) in enumerate(network):
         seen.append(values)
@@ -26,7 +26,7 @@ def forward(network: Layers, inputs: np.ndarray) -> tuple[np.ndarray, list[np.nd
 
 
 def backward(network: Layers, seen: list[np.ndarray], gradient: np.ndarray) -> tuple[Layers, np.ndarray]:
-    """Gradients of all layers and of the inputs, from that of the outputs."""
+    """Return the gradients of all layers and of the inputs, given that of the outputs and each layer's inputs ``seen``."""
     found: Layers = []
     for (kernel, _), values in zip(network[::-1], seen[::-1], strict=True):
         found.append((values.T @ gradient, gradient.sum(axis=0)))
@@ -35,12 +35,12 @@ def backward(network: Layers, seen: list[np.ndarray], gradient: np.ndarray) -> t
 
 
 def followed(online: Layers, target: Layers, decay: float) -> Layers:
-    """The target network after one update."""
+    """Return the target network after one update: decay * target + (1 - decay) * online."""
     return [tuple(decay * old + (1.0 - decay) * new for old, new in zip(*both)) for both in zip(target, online)]
 
 
 class Adam:
-    """The optimiser of one network (Kingma and Ba, 2015)."""
+    """Adam optimiser of one network (Kingma and Ba, 2015), with its usual decay rates."""
 
     def __init__(self, rate: float):
         self.rate, self.count, self.means, self.squares = rate, 0, None, None

@@ -1,4 +1,4 @@
-"""Programs for NVIDIA GPUs, traced and lowered without one."""
+"""Tracing and lowering of programs for NVIDIA GPUs, without a GPU."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -9,7 +9,7 @@ import jax
 
 @contextlib.contextmanager
 def described_nvidia() -> Iterator[None]:
-    """Says which GPU programs are for. JAX 0.11 asks that before it lowers a kernel; 0.10 neither asks nor can be told."""
+    """Declare the GPU that programs are lowered for, which JAX 0.11 requires for kernels; no effect with JAX 0.10."""
     if jax.__version_info__ < (0, 11):
         yield
         return
@@ -20,6 +20,6 @@ def described_nvidia() -> Iterator[None]:
 
 
 def lowered_for_nvidia(trace: Callable[[], Any]) -> str:
-    """What a program (`jax.stages.Traced`) is lowered to; ``trace`` makes it."""
+    """Return the text of a program lowered for CUDA; ``trace`` returns its `jax.stages.Traced`."""
     with described_nvidia():
         return trace().lower(lowering_platforms=("cuda",)).as_text()

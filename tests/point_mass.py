@@ -1,4 +1,4 @@
-"""An environment that compiles in a moment, made as a user would make one: a ball on two rails, a motor for each."""
+"""Environment that compiles quickly, written as a user would write one: a ball on two sliders, each with a motor."""
 
 import contextlib
 import dataclasses
@@ -77,7 +77,7 @@ class PointMass(MjxGoalEnv):
 
 
 class StatePointMass(PointMass):
-    """The same, which observes position and velocity."""
+    """Point mass whose observation is its position and velocity [4] instead of an image."""
 
     def _observer(self, config: PointMassConfig) -> Any:
         return None
@@ -88,11 +88,10 @@ class StatePointMass(PointMass):
 
 @contextlib.contextmanager
 def registered(programs_folder: Path | None = None) -> Iterator[None]:
-    """Make the environment known as VisualPoint.
+    """Register the environment as VisualPoint within the context.
 
     Args:
-        programs_folder: A folder in which programs are kept once they are traced, as those of built-in environments are; None
-            keeps none.
+        programs_folder: Folder in which traced programs are cached, as those of built-in environments are; None for no cache.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(registry._ENTRIES, "VisualPoint", registry._Entry(PointMass, PointMassConfig))

@@ -1,6 +1,6 @@
-"""Environments so small that the right answer is known, each failing for one reason only (after Andy Jones, "Debugging RL").
+"""Environments so small that the right answer is known, each isolating one failure (after Andy Jones, "Debugging RL").
 
-They are pure arithmetic: no MuJoCo, no images, a few steps.
+They are pure arithmetic, without MuJoCo and rendering, and episodes have a few steps.
 """
 
 import jax
@@ -10,9 +10,9 @@ from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
 
 
 class Probe(GoalEnv):
-    """A point that may or may not move, with a start and a goal.
+    """Environment of a point on a line, with a start and a goal.
 
-    The observation holds the point (or nothing), the goal's observation holds the goal (or nothing).
+    Subclasses define `start`, and may define `move`; by default, the point stays. Point and goal are observed by `see`.
     """
 
     threshold = 0.1
@@ -22,15 +22,15 @@ class Probe(GoalEnv):
     name = "Probe"
 
     def start(self, key):
-        """Start and goal of an episode, [1] each."""
+        """Sample start and goal of an episode, [1] each."""
         raise NotImplementedError
 
     def move(self, position, action):
-        """The point after an action."""
+        """Return the point [1] after an action [1]."""
         return position
 
     def see(self, position):
-        """What an observation shows of a point."""
+        """Return the observation of a point [1]; by default the point itself."""
         return position
 
     def reset(self, key):
@@ -48,14 +48,14 @@ class Probe(GoalEnv):
 
 
 class AlwaysThere(Probe):
-    """The start is the goal and nothing moves: every reward is R+, every value R+ / (1 - gamma). Tests the value loss."""
+    """Probe whose start is the goal: every reward is R+, every value R+ / (1 - gamma). Tests the value loss."""
 
     def start(self, key):
         return jnp.zeros(1), jnp.zeros(1)
 
 
 class ThreeStepsAway(Probe):
-    """The point moves from -3 by one a step to the goal at 0 and stays, whatever the action. Tests discounting.
+    """Probe that moves from -3 by one per step to the goal at 0 and stays, whatever the action. Tests discounting.
 
     With rewards 0/-1 the values at -3, -2, -1, 0 are -1 - gamma, -1, 0, 0.
     """
@@ -68,21 +68,21 @@ class ThreeStepsAway(Probe):
 
 
 class TwoPlaces(Probe):
-    """The point stays where it starts, at 0 or 1; the goal is 0. Tests that the value depends on the observation."""
+    """Probe that stays at its start, 0 or 1; the goal is 0. Tests that the value depends on the observation."""
 
     def start(self, key):
         return jax.random.bernoulli(key, 0.5, (1,)).astype(jnp.float32), jnp.zeros(1)
 
 
 class TwoGoals(Probe):
-    """The point stays at 0; the goal is 0 or 1. Tests that the value depends on the goal."""
+    """Probe that stays at 0; the goal is 0 or 1. Tests that the value depends on the goal."""
 
     def start(self, key):
         return jnp.zeros(1), jax.random.bernoulli(key, 0.5, (1,)).astype(jnp.float32)
 
 
 class GoWhereTold(Probe):
-    """The action is where the point goes; the goal lies in (-0.8, 0.8). Tests that the policy follows the goal."""
+    """Probe that moves to the action; the goal lies in [-0.8, 0.8). Tests that the policy follows the goal."""
 
     def start(self, key):
         return jnp.zeros(1), jax.random.uniform(key, (1,), minval=-0.8, maxval=0.8)
@@ -92,7 +92,7 @@ class GoWhereTold(Probe):
 
 
 class GoAgainstTheSign(Probe):
-    """The goal is at the end (-1 or 1) that the observation's sign shows, not the goal. Tests that the policy looks."""
+    """Probe of one step from -1 or 1 to the opposite goal, by an action of its sign. Tests that the policy uses its inputs."""
 
     horizon = 1
 
@@ -108,7 +108,7 @@ class GoAgainstTheSign(Probe):
 
 
 class PointImage(Probe):
-    """A drifting point as a 4x4 image whose bytes never repeat within an episode: every frame is one of a kind."""
+    """Probe that drifts, observed as an image [1, 4, 4] uint8 of its float32 bytes: frames of an episode are all different."""
 
     def start(self, key):
         return jax.random.uniform(key, (1,)), jnp.full(1, 100.0)
@@ -122,7 +122,7 @@ class PointImage(Probe):
 
 
 class SeenGoWhereTold(GoWhereTold):
-    """`GoWhereTold` as an image: the point is a bright column of 8x8 pixels, and the goal is where the column shall be."""
+    """`GoWhereTold` observed as images [1, 8, 8] uint8, in which a bright column shows the position of point or goal."""
 
     def see(self, position):
         column = jnp.arange(8, dtype=jnp.float32) - 3.5

@@ -1,4 +1,4 @@
-"""How each kind of file from outside is read, for `readers_worker`: the reader, what its values are like, and its errors."""
+"""Readers of each kind of file from outside for `readers_worker`, with checks of their values, and their errors."""
 
 import csv
 import io
@@ -13,7 +13,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs import documents
 
 ANNOTATED = (48, 64)
-"""Height and width of images that annotations are of."""
+"""Height and width of annotated images."""
 IMAGE = (12, 20)
 PAIRS = ("000", "001", "002")
 
@@ -45,7 +45,7 @@ def read_calibration(folder: Path) -> None:
 
 
 def read_cameras(folder: Path) -> None:
-    """What any program says of two cameras, rectified or not."""
+    """Read two cameras, rectified or not, from the calibration of any program, and check that numbers are finite."""
     from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import UnrectifiedPair
     from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import read_cameras
 
@@ -81,7 +81,7 @@ def _plan(path: Path) -> None:
 
 
 def read_any_annotations(folder: Path) -> None:
-    """Annotations beside an image of their size."""
+    """Read annotations beside an image of their size, and check them."""
     import cv2
 
     (folder / "a.png").write_bytes(cv2.imencode(".png", np.full(ANNOTATED, 90, np.uint8))[1].tobytes())
@@ -158,7 +158,7 @@ def read_image(folder: Path) -> None:
 
 
 def read_names(folder: Path) -> None:
-    """Plots of a folder of empty files: each image is at most one side of one pair, and what is not found is no pair's."""
+    """Find the plots in a folder of empty files, and check that no file and no name is used twice."""
     from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
     from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries
 
@@ -237,7 +237,7 @@ def read_truth(folder: Path) -> None:
 
 
 def read_records(folder: Path) -> None:
-    """What `phenotype run` kept of a pair: as good as new, or computed again."""
+    """Check that a record of `phenotype run` that counts as current holds valid sightings; others would be computed again."""
     from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles
     from jaxrl_vis.stalks.phenotyping.pipeline import _is_complete, _sources
     from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
@@ -304,4 +304,4 @@ READERS = {
     "record": Reader(read_records, _parses(documents.read_json), ()),
     "model": Reader(read_model, _parses(_loads), (ValueError,)),
 }
-"""By name."""
+"""Readers by kind of file."""

@@ -1,4 +1,4 @@
-"""How the files of a run's folder are read, for `readers_worker`."""
+"""Readers of the files in a run's folder, for `readers_worker`."""
 
 import json
 from pathlib import Path
@@ -49,4 +49,4 @@ READERS: dict[str, Reader] = {
     "config": Reader(read_config, lambda folder: _json(folder / "config.json"), (RequestError,)),
     "metrics": Reader(read_rows, lambda folder: _some_lines(folder / "metrics.jsonl"), (RequestError,)),
 }
-"""By name."""
+"""Readers by kind of file."""

@@ -1,10 +1,10 @@
-"""Readers of files from outside, one call each, in a process of their own: what is written in C may end it, and that is told.
+"""Calls of the readers of files from outside in a separate process, whose crashes (in libraries written in C) are reported.
 
     worker = Worker()
     outcome = worker.read("calibration", {"rig.yaml": b"..."})
 
-A reader is a function of a folder. Time is that of the processor, so that a busy machine fails nothing, and memory is the
-highest that the call reached above what was there before.
+A reader is a function of a folder. Times are CPU times, so that the load of the machine does not matter, and memory is the peak
+of the call above the memory in use before.
 """
 
 import contextlib
@@ -29,13 +29,13 @@ _PATIENCE = 60  # s of the clock after which a call is taken to hang
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What came of a call.
+    """Outcome of a call.
 
     Attributes:
         kind: ``value``, ``refused`` (one of the reader's own errors), or ``fault``.
-        past: Whether the file was what its parser takes.
-        text: Of the error; of a fault, the traceback.
-        seconds, megabytes: What it took.
+        past: True if the parser accepted the file.
+        text: Message of the error; of a fault, the traceback.
+        seconds, megabytes: CPU time, s, and peak memory, MB, of the call.
     """
 
     kind: str
@@ -47,12 +47,12 @@ class Outcome:
 
 @dataclasses.dataclass(frozen=True)
 class Reader:
-    """How a kind of file is read.
+    """Reader of a kind of file.
 
     Attributes:
-        read: From the folder that holds the files to a value, which it checks.
-        past: Whether the files are what the parser takes.
-        own: Errors that it may raise.
+        read: Function that reads the files in a folder, and checks the result.
+        past: Function that returns True if the parser accepts the files in a folder.
+        own: Errors that it may raise for bad files.
     """
 
     read: Callable[[Path], Any]
@@ -61,7 +61,7 @@ class Reader:
 
 
 def call(reader: Reader, folder: Path) -> Outcome:
-    """One call, in this process."""
+    """Call a reader in this process, and return the outcome."""
     import traceback
 
     past = reader.past(folder)
@@ -85,7 +85,7 @@ def call(reader: Reader, folder: Path) -> Outcome:
 
 
 def _reset_peak() -> float:
-    """The memory in use, MB; from here on, its peak is counted anew where the system can do that."""
+    """Reset the peak memory if the system supports it, and return the memory in use, MB; else return the peak so far."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
         return _peak()
@@ -100,7 +100,7 @@ def _peak() -> float:
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Makes the folder anew, with these files in it."""
+    """Create a folder with these files, replacing an existing one."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
@@ -111,14 +111,14 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 class Worker:
-    """A process that reads; it is started when it is first needed, and again where it ended."""
+    """Process that calls readers; started at the first call, and again after a crash."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._folder = Path(tempfile.mkdtemp(prefix="readers-"))
 
     def close(self) -> None:
-        """Ends it."""
+        """Kill the process, and remove its folder."""
         if self._process is not None:
             self._process.kill()
             self._process.communicate()
@@ -126,7 +126,10 @@ class Worker:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def read(self, name: str, files: Mapping[str, bytes]) -> Outcome:
-        """What comes of reading these files; a process that ended is a fault, and starts anew."""
+        """Return the outcome of reading files, given by name.
+
+        A crash of the process is a fault, or a refusal if MuJoCo's own parser crashed; the next call starts a new process.
+        """
         if os.environ.get("JAXRL_VIS_READERS_HERE"):  # so that coverage sees them
             write_files(self._folder / "files", files)
             return dataclasses.replace(call(readers()[name], self._folder / "files"), seconds=0.0, megabytes=0.0)
@@ -159,7 +162,7 @@ class Worker:
 
 
 def serve(folder: Path) -> None:
-    """Answers what comes by the standard input, until it ends."""
+    """Answer calls from standard input, in files below ``folder``, until it ends."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # libraries print
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -178,7 +181,7 @@ def serve(folder: Path) -> None:
 
 
 def readers() -> dict[str, Reader]:
-    """All readers by name."""
+    """Return all readers by kind of file."""
     import readers_of_files
     import readers_of_runs
 

@@ -25,7 +25,7 @@ PLANE, SKY, BARE, TEXTURED = "plane", "sky", "bare", "textured"
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """Bound of a measure: ``at_least`` or ``at_most``."""
+    """Bound of a measure: a lower one if ``at_least`` is true, else an upper one."""
 
     limit: float
     at_least: bool
@@ -93,7 +93,7 @@ def matched_shares(ours: Any, theirs: Any) -> dict[int, float]:
 
     Args:
         ours: A `Frame` of NumPy arrays.
-        theirs: The other one.
+        theirs: The reference, likewise.
     """
     found = {}
     either_will_do = coincident(ours, theirs)
@@ -113,11 +113,11 @@ class Tally:
     Attributes:
         kinds: `surface_kinds` of the model.
         images: Number of images added.
-        kept: Pixels away from edges.
-        agreeing: Those of them where the segmentations agree.
-        solid: Kept pixels that show an object in either image.
-        close: Those of them where the depths agree.
-        worst: Minimum IoU, with its object and image.
+        kept: Number of pixels away from edges.
+        agreeing: Number of these where the segmentations agree.
+        solid: Number of kept pixels that show an object in either image.
+        close: Number of these where the depths agree.
+        worst: Minimum IoU, with the indices of its object and image.
         worst_match: Minimum of `matched_shares`, likewise.
         colours: Counts [256] of absolute differences of colour values, in 1/255, by kind of surface.
     """

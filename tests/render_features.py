@@ -1,7 +1,7 @@
-"""Small scenes, each of which shows one thing that the renderer can do: a type of geom, of light, of texture, of camera.
+"""Small scenes, each of which shows one feature of the renderer: a type of geom, light, texture or camera.
 
 All have a floor, things on mocap bodies called ``thing...`` and a camera on a mocap body called ``eye``, so that poses can be
-drawn at random (see `render_models.set_pose`). Lengths in metres.
+sampled (see `render_models.set_pose`). Lengths in metres.
 """
 
 import dataclasses
@@ -18,20 +18,20 @@ class Feature:
     """Parts of a scene's XML.
 
     Attributes:
-        sheet: The page of docs/renderer/ that shows it.
-        title: What it shows, for people.
+        sheet: Page of docs/renderer/ that shows the feature.
+        title: Title of the feature on that page.
         things: Attributes of one geom each, without the position; up to six.
-        assets: Inside ``<asset>``.
-        lights: The lights.
+        assets: Elements of ``<asset>``.
+        lights: Elements of the lights.
         floor: Attributes of the floor, a geom; none if empty.
         camera: Attributes of the camera.
-        visual: Inside ``<visual>``.
+        visual: Elements of ``<visual>``.
         sites: Attributes of one site each, on the things' bodies.
-        stand_in: What the truth is drawn with in the place of some text of ``lights``: (old, new). MuJoCo's own renderer leaves
-            lights of type "point" out, but draws a spot light of cutoff 180, which is OpenGL's point light.
-        eye: Where the camera is before it is moved at random: it stays above the floor, or below.
-        limits: Measures of the comparison and closer bounds for them, where the common ones would let the fault pass.
-        sizes: Sizes that the things get once the model is compiled, which would refuse some of them.
+        stand_in: Replacement (old, new) in ``lights`` for the reference image; None for none. MuJoCo's own renderer omits
+            lights of type "point", but draws a spot light of cutoff 180, which is OpenGL's point light.
+        eye: Position of the camera before it is moved at random, on the same side of the floor, m.
+        limits: Upper bounds of measures of the comparison, where the common ones would let a fault pass.
+        sizes: Sizes of the first things, set after compilation, which would refuse some of them.
     """
 
     sheet: str
@@ -299,12 +299,12 @@ FEATURES: dict[str, Feature] = {**_geoms(), **_lights(), **_textures(), **_views
 
 
 def truth_of(feature: Feature) -> Feature:
-    """The feature as MuJoCo's own renderer is shown it; the same for all that have no stand-in."""
+    """Return the feature for MuJoCo's own renderer, with its stand-in applied; itself if it has none."""
     return dataclasses.replace(feature, lights=feature.lights.replace(*feature.stand_in)) if feature.stand_in else feature
 
 
 def scene_spec(feature: Feature) -> mujoco.MjSpec:
-    """The scene, ready to be compiled."""
+    """Return the scene of a feature, not yet compiled."""
     things = []
     for number, (attributes, (x, y, z)) in enumerate(zip(feature.things, _PLACES, strict=False)):
         site = f'<site pos=".1 0 .1" rgba="1 .5 1 1" {feature.sites[number]}/>' if number < len(feature.sites) else ""
@@ -328,7 +328,7 @@ def scene_spec(feature: Feature) -> mujoco.MjSpec:
 
 
 def _image() -> bytes:
-    """A PNG that looks different in every corner and from behind: red grows to the right, green downwards, an L in blue."""
+    """Return a PNG of 48 x 48 pixels without symmetry: red increases to the right, green downwards, with a blue L."""
     rows, columns = np.mgrid[0:48, 0:48]
     pixels = np.stack([40 + 4 * columns, 40 + 4 * rows, np.full_like(rows, 60)], axis=-1).astype(np.uint8)
     pixels[8:40, 8:14] = pixels[34:40, 8:30] = (40, 60, 230)

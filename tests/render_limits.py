@@ -1,4 +1,4 @@
-"""Scenes of which our images differ from MuJoCo's own, as the table of limits in docs/renderer.md says; `cam` sees them."""
+"""Scenes whose images by our renderer differ from MuJoCo's, as listed in docs/renderer.md; their camera is called `cam`."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ _SKY = '<texture type="skybox" builtin="gradient" rgb1=".4 .6 .9" rgb2=".1 .1 .2
 
 
 class Limit(NamedTuple):
-    """A scene: what stands under its picture, its MJCF, and whether MuJoCo shows effects (shadows, reflections) in it."""
+    """Scene: its caption, its MJCF, and True for ``effects`` if MuJoCo renders shadows and reflections in it."""
 
     title: str
     xml: str

@@ -1,7 +1,7 @@
-"""Models that the renderer is compared on with MuJoCo's own: ours, public ones from their packages, and one for each feature.
+"""Models for comparing the renderer with MuJoCo's own: ours, public ones from their packages, and one for each feature.
 
-Public models are read where pip put them (dm_control, mujoco-mjx, mujoco), never copied. `build` returns a model that is ready
-to be drawn by both renderers; `set_pose` puts it into the pose of a seed and a number.
+Public models are read where pip put them (dm_control, mujoco-mjx, mujoco), never copied. `build` returns a model for
+both renderers; `set_pose` sets one of its random poses by number.
 """
 
 import dataclasses
@@ -34,20 +34,20 @@ _VIEW = (120.0, -25.0, 1.5)
 
 @dataclasses.dataclass(frozen=True)
 class RenderModel:
-    """A model and the camera that sees it.
+    """Model, and the camera that it is rendered from.
 
     Attributes:
-        source: What it comes from: "ours", the name of a distribution, or "feature".
-        load: Reads it; called without arguments.
-        camera: Name or index of one of its cameras; `FREE_CAMERA` for MuJoCo's default free one; None for one that `build`
+        source: Origin of the model: "ours", the name of a distribution, or "feature".
+        load: Function without arguments that loads the model.
+        camera: Name or index of one of its cameras; `FREE_CAMERA` for MuJoCo's default free camera; None for one that `build`
             adds.
         view: For an added camera: azimuth and elevation in degrees as MuJoCo's free camera counts them, and the distance in
             multiples of the model's extent.
         site_groups: Groups of sites that are drawn.
-        leave_out: What is not drawn, as `Scene.from_mjmodel` takes it.
-        limits: Bounds of its own, see `Tally.failures`.
-        plane_backs: As `Scene.from_mjmodel` takes it: True where planes turn around.
-        finish: Changes the compiled model in place.
+        leave_out: Elements that are not drawn, see `Scene.from_mjmodel`.
+        limits: Additional bounds of this model, see `Tally.failures`.
+        plane_backs: Option of `Scene.from_mjmodel`; True for models with planes that turn.
+        finish: Function that changes the compiled model in place; None for none.
     """
 
     source: str
@@ -62,7 +62,11 @@ class RenderModel:
 
 
 def package_folder(name: str) -> pathlib.Path:
-    """Where pip put a package, without importing it."""
+    """Return the folder of an installed package, without importing it.
+
+    Raises:
+        ModuleNotFoundError: The package is not installed.
+    """
     found = importlib.util.find_spec(name)
     if found is None or not found.submodule_search_locations:
         raise ModuleNotFoundError(f"the package {name} is missing: install the dev dependencies (make test does)", name=name)
@@ -74,12 +78,12 @@ def _from_package(package: str, path: str) -> Callable[[], mujoco.MjSpec]:
 
 
 def _suite(domain: str, camera: str | int | None = 0, **more: Any) -> RenderModel:
-    """A domain of the dm_control suite, as its file has it; seen by its first camera unless another is named."""
+    """Return a domain of the dm_control suite, unchanged; seen by its first camera unless another is given."""
     return RenderModel("dm-control", _from_package("dm_control", f"suite/{domain}.xml"), camera, **more)
 
 
 def _mjx(path: str, camera: int | None = None, **more: Any) -> RenderModel:
-    """A test model of mujoco-mjx."""
+    """Return a test model of mujoco-mjx."""
     return RenderModel("mujoco-mjx", _from_package("mujoco", f"mjx/test_data/{path}.xml"), camera, **more)
 
 
@@ -101,19 +105,19 @@ def _feature(name: str) -> RenderModel:
 
 
 def _raise_terrain(mj_model: mujoco.MjModel) -> None:
-    """Gives the quadruped's flat terrain the bowl with bumps that its escape task starts from (the formula is ours)."""
+    """Give the quadruped's flat terrain a bowl with bumps, as in its escape task (by our own formula)."""
     rows, columns = np.mgrid[-1.0 : 1.0 : mj_model.hfield_nrow[0] * 1j, -1.0 : 1.0 : mj_model.hfield_ncol[0] * 1j]
     bowl = np.clip(2.5 * np.hypot(rows, columns) ** 2, 0.0, 1.0)
     mj_model.hfield_data[:] = (bowl * (0.7 + 0.3 * np.sin(40.0 * rows) * np.cos(35.0 * columns))).reshape(-1)
 
 
 def _lower_ground(mj_model: mujoco.MjModel) -> None:
-    """Puts the ground 0.4 m lower, because the robot starts inside it."""
+    """Lower the ground by 0.4 m, because the robot starts inside it."""
     mj_model.geom_pos[mj_model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD, 2] -= 0.4
 
 
 def _look_from_the_left(mj_model: mujoco.MjModel) -> None:
-    """Makes the model's free camera orthographic, and has it look from another side."""
+    """Make the model's free camera orthographic, and turn it to another side."""
     view = mj_model.vis.global_
     view.orthographic, view.fovy, view.azimuth, view.elevation = 1, 2.5, 20.0, -15.0
 
@@ -144,13 +148,13 @@ MODELS: dict[str, RenderModel] = {
 
 
 def build(name: str, truth: bool = False) -> tuple[mujoco.MjModel, int]:
-    """The model, ready to be drawn, and the index of its camera.
+    """Build a model for rendering; return it and the index of its camera.
 
     Multisampling is off and surfaces are finely divided; nothing else of the model's appearance is changed.
 
     Args:
         name: One of `MODELS`.
-        truth: Whether it is for MuJoCo's own renderer, which a few features need a stand-in for.
+        truth: If true, build it for MuJoCo's own renderer, for which a few features need a stand-in.
 
     Raises:
         KeyError: There is no such model in `MODELS`.
@@ -173,7 +177,7 @@ def build(name: str, truth: bool = False) -> tuple[mujoco.MjModel, int]:
 
 
 def make_scene(name: str, mj_model: mujoco.MjModel, camera: int, height: int, width: int) -> Scene:
-    """Our scene of a model that `build` made.
+    """Return our scene of a model from `build`.
 
     Raises:
         ValueError: Our renderer cannot draw it.
@@ -191,7 +195,7 @@ def make_scene(name: str, mj_model: mujoco.MjModel, camera: int, height: int, wi
 
 
 def _add_camera(spec: mujoco.MjSpec, view: tuple[float, ...]) -> None:
-    """Adds a fixed camera that looks at the model's middle as MuJoCo's free camera would."""
+    """Add a fixed camera that looks at the model's centre as MuJoCo's free camera would."""
     mj_model = spec.compile()
     azimuth, elevation = np.deg2rad(view[:2])
     ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
@@ -206,7 +210,7 @@ def _add_camera(spec: mujoco.MjSpec, view: tuple[float, ...]) -> None:
 
 
 def set_pose(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, number: int) -> None:
-    """Puts the joints into random pose ``number``, and the mocap bodies of the feature scenes too; runs the kinematics."""
+    """Set the joints, and the mocap bodies of feature scenes, to random pose ``number``, and run the kinematics, in place."""
     rng = np.random.default_rng([SEED, number])
     scatter_joints(mj_model, mj_data, rng)
     for body in np.flatnonzero(mj_model.body_mocapid >= 0):
@@ -223,7 +227,7 @@ def set_pose(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, number: int) -> N
 
 
 def _orbit(position: np.ndarray, quaternion: np.ndarray, rng: np.random.Generator) -> None:
-    """Puts the eye somewhere around the middle of a feature scene, looking at it, on the side of the floor that it is on."""
+    """Move the eye of a feature scene to a random place on its side of the floor, looking at the centre, in place."""
     side = np.sign(position[2])
     turn, distance = rng.uniform(-np.pi, np.pi), rng.uniform(1.2, 1.8)
     position[:] = distance * np.cos(turn), distance * np.sin(turn), side * rng.uniform(0.6, 1.5)
@@ -234,20 +238,20 @@ def _orbit(position: np.ndarray, quaternion: np.ndarray, rng: np.random.Generato
 
 
 def poses_of(mj_data: mujoco.MjData) -> dict[str, np.ndarray]:
-    """What the renderer reads of MjData, as a dictionary that `jax.vmap` understands."""
+    """Return the fields of MjData that the renderer reads, as a dictionary of float32 arrays."""
     names = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "xipos")
     return {name: np.array(getattr(mj_data, name), np.float32) for name in names}
 
 
 def draw(scene: Scene, poses: list[dict[str, np.ndarray]], quick: bool = False) -> list[Frame]:
-    """Our images of several poses, each from `poses_of`: frames of NumPy arrays.
+    """Render several poses, each from `poses_of`; return a frame of NumPy arrays for each.
 
-    The scene is an argument of the compiled program: scenes that are alike in all but numbers share it.
+    The scene is an argument of the compiled program: scenes that differ only in the values of arrays share it.
 
     Args:
         scene: From `make_scene`.
-        poses: The poses.
-        quick: Whether the compiler may spend less on making the program fast, which pays for a handful of small images.
+        poses: Poses, at least one.
+        quick: If true, compile without optimisation, which takes less time for a handful of small images.
     """
     drawer = _draw_quick if quick else _draw_all
     frames = jax.tree.map(np.asarray, drawer(scene, jax.tree.map(lambda *rows: np.stack(rows), *poses)))
@@ -265,7 +269,7 @@ _draw_all, _draw_quick = (
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> int:
-    """A number that changes with the model's appearance, so with another version of the package that it comes from."""
+    """Return a checksum of the model's appearance, which may change with the version of the package that it comes from."""
     numbers = (
         mj_model.geom_type, mj_model.geom_size, mj_model.geom_pos, mj_model.geom_rgba, mj_model.body_pos, mj_model.light_pos,
         mj_model.cam_pos, mj_model.mat_rgba, mj_model.mesh_vert, mj_model.hfield_data,
@@ -278,5 +282,5 @@ def fingerprint(mj_model: mujoco.MjModel) -> int:
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that models come from."""
+    """Return the versions of the packages that models come from, by name."""
     return {name: importlib.metadata.version(name) for name in ("mujoco", "mujoco-mjx", "dm-control")}

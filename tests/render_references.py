@@ -1,8 +1,8 @@
-"""Stored images of MuJoCo's own renderer: how they are packed, so that many fit into little.
+"""Compact storage of reference images of MuJoCo's own renderer.
 
 One ``.npz`` for each model. Colours are kept exactly. Depth is kept as a 16-bit logarithm between the near and the far plane,
-good to 0.01 %, where the comparison allows 0.1 %. Neighbouring pixels are subtracted from each other, because the compression
-of ``.npz`` knows nothing of images.
+good to 0.01 %, where the comparison allows 0.1 %. Differences of neighbouring pixels are stored, because the compression of
+``.npz`` does not exploit the smoothness of images.
 """
 
 import pathlib
@@ -18,15 +18,15 @@ class References(NamedTuple):
     """Images of one model in P poses.
 
     Attributes:
-        fingerprint: Of the model that was drawn, see `render_models.fingerprint`.
+        fingerprint: Checksum of the rendered model, see `render_models.fingerprint`; 0 if not computed.
         qpos: [P, nq] float64.
         mocap_pos: [P, nmocap, 3] float64.
         mocap_quat: [P, nmocap, 4] float64.
         rgb: [P, H, W, 3] uint8.
         depth: [P, H, W] float32, planar metres.
-        segmentation: [P, H, W] int32, as `Frame` has it.
-        near: Metres, the near plane.
-        far: Metres, the far plane, which is the depth of the sky.
+        segmentation: [P, H, W] int32, see `Frame`.
+        near: Distance of the near plane, m.
+        far: Distance of the far plane, which is the depth of the sky, m.
     """
 
     fingerprint: int
@@ -41,7 +41,7 @@ class References(NamedTuple):
 
 
 def save(name: str, references: References) -> pathlib.Path:
-    """Writes a model's images into `FOLDER`."""
+    """Write a model's images to `FOLDER`, and return the path of the file."""
     near, far = references.near, references.far
     scaled = np.log(references.depth.astype(np.float64) / near) / np.log(far / near)
     depth = np.where(references.segmentation < 0, _STEPS + 1, np.clip(np.rint(scaled * _STEPS), 0, _STEPS)).astype(np.uint16)
@@ -57,10 +57,10 @@ def save(name: str, references: References) -> pathlib.Path:
 
 
 def load(name: str) -> References:
-    """Reads a model's images.
+    """Read a model's images.
 
     Raises:
-        FileNotFoundError: There are none; make_render_references.py makes them.
+        FileNotFoundError: There are none; make_render_references.py generates them.
     """
     path = FOLDER / f"{name}.npz"
     if not path.exists():
@@ -84,7 +84,7 @@ def load(name: str) -> References:
 
 
 def _differences(planes: np.ndarray) -> np.ndarray:
-    """Each value less its left neighbour, modulo the type's range: the left column stays, and `_sums` gives it all back."""
+    """Subtract from each value its left neighbour, modulo the range of the dtype; the left column stays. `_sums` inverts it."""
     return np.diff(planes, axis=-1, prepend=np.zeros_like(planes[..., :1]))
 
 

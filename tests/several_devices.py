@@ -1,6 +1,6 @@
-"""Trains on four devices of a CPU, as a script of its own: the number of devices is settled when JAX starts.
+"""Script that trains on four CPU devices; a separate process, as JAX fixes the number of devices when it starts.
 
-Prints a line of JSON: the name of each comparison and the largest difference found.
+It prints a line of JSON: the result of each comparison by name, such as the largest difference.
 """
 
 import json
@@ -35,7 +35,7 @@ COLLECTIVES = ("all-reduce", "all-gather", "all-to-all", "collective-permute", "
 
 
 class Emulated(Layout):
-    """The parts of each learner side by side on one device: the same functions, mapped by `jax.vmap`."""
+    """Layout with the shards of each learner side by side on one device: the same functions, mapped by `jax.vmap`."""
 
     def spread(self, function, in_specs, out_specs, jit, kept_as=None, **options):
         count = self.shards.count
@@ -54,7 +54,7 @@ class Emulated(Layout):
             return leaf.reshape(*leaf.shape[:axis], -1, *leaf.shape[axis + 2 :])
 
         def are_alike(spec, leaf):
-            """Whether all parts have the same where they should: or else one device would not know what another does."""
+            """Return True if a leaf is sharded, or if the copies of a replicated leaf are equal on all shards."""
             same = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
             return DATA in spec or jnp.array_equal(same, jnp.broadcast_to(same[0], same.shape), equal_nan=True)
 
@@ -80,7 +80,7 @@ class Emulated(Layout):
 
 
 def trained(config, layout=None, iterations=3):
-    """The program, the last loop state, and the metrics of all iterations and of an evaluation."""
+    """Train, and return the program, the last loop state, and the metrics of all iterations and of an evaluation."""
     program = make_train_step(ENV, config, layout)
     keys = jnp.stack([jax.random.key(seed) for seed in range(config.run.seeds)])
     loop, found = program.init(program.layout.put(keys, program.layout.by_seed)), []
@@ -92,7 +92,7 @@ def trained(config, layout=None, iterations=3):
 
 
 def trained_by_run(config, iterations=3):
-    """The last loop state and the metrics of all iterations, as a run computes them."""
+    """Train with the programs of a run, and return the last loop state and the metrics of all iterations."""
     programs = Programs(config, make_train_step(ENV, config))
     loop, found = programs.init(programs.run_keys), []
     for _ in range(iterations):
@@ -108,14 +108,17 @@ def plain(tree):
 
 
 def difference(one, other):
-    """The largest difference between two trees, of episodes whatever their shape."""
+    """Return the largest absolute difference between two trees, whose leaves are compared flattened."""
     one, other = plain(one), plain(other)
     assert one.keys() == other.keys()
     return max(float(np.max(np.abs(one[name].ravel().astype(np.float64) - other[name].ravel()))) for name in one)
 
 
 def restored_differences(loop, folder):
-    """What a checkpoint of two devices holds, restored on other numbers of them: bytes that differ."""
+    """Save a checkpoint and restore it on several numbers of devices.
+
+    Return, by name of the case, the names of leaves that differ and the numbers of devices that replay is on.
+    """
     checkpoints = Checkpoints(Path(folder), echo=lambda line: None)
     checkpoints.save_full(3, loop, {})
     found = {}
@@ -133,7 +136,10 @@ def restored_differences(loop, folder):
 
 
 def resumed(loop, folder, program):
-    """An iteration on one device, after what two devices have saved."""
+    """Save the loop state of several devices, restore it on one, and train for an iteration there.
+
+    Return the number of the iteration, and True if all metrics are finite.
+    """
     checkpoints = Checkpoints(Path(folder), echo=lambda line: None)
     checkpoints.save_full(3, loop, {})
     restored = checkpoints.restore_for_resume(jax.eval_shape(program.init, jnp.stack([jax.random.key(0)] * CONFIG.run.seeds)))

@@ -1,4 +1,4 @@
-"""Real programs of the smallest preset, made once a process: traced and lowered by the first test that trains with one."""
+"""Real programs of the smallest preset, created once per process: the first test that trains with one traces it."""
 
 import collections
 import dataclasses
@@ -32,12 +32,12 @@ def _program_of(config: Config) -> train_step.TrainStep:
 
 
 def make_train_step(env: GoalEnv, config: Config, policy_alone: bool = False) -> train_step.TrainStep:
-    """To take the place of `train_step.make_train_step`: the functions that an equal configuration has got before."""
+    """Replacement for `train_step.make_train_step` that reuses the functions of an earlier equal configuration."""
     if policy_alone:
         return train_step.make_train_step(env, config, policy_alone=True)
     return dataclasses.replace(_program_of(_trained_alike(config)), config=config)
 
 
 def traces(config: Config) -> int:
-    """How often this process has traced what follows the rollouts of a configuration."""
+    """Return the number of times that this process has traced `learn` of a configuration."""
     return _TRACES[_trained_alike(config)]

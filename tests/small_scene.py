@@ -1,4 +1,4 @@
-"""A small scene with a bit of everything that the fast implementations support."""
+"""Small scene with a bit of everything that the fast implementations support."""
 
 from types import SimpleNamespace
 from typing import Any

@@ -1,4 +1,4 @@
-"""Settings of networks that compile quickly, and images as large as they are made for."""
+"""Settings of stalk detection networks that compile quickly, and the height and width of their images."""
 
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 

@@ -1,8 +1,8 @@
-"""One of several processes that train as one, on a device each: a script, which the tests start twice.
+"""Script of one of several processes that train together, with one device each; the tests start it twice.
 
 python two_processes.py RUN_DIR HOST:PORT COUNT INDEX [steps=N] [die_at=ITERATION] [resume=1] ...
 
-With COUNT 1 it trains alone. It ends as the command line would.
+With COUNT 1 it trains alone. Its exit status is that of the command line.
 """
 
 import os

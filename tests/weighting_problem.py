@@ -1,4 +1,4 @@
-"""What tests of weightings share: three losses of a network small enough to differentiate by finite differences."""
+"""Problem for tests of weightings: three losses of a network small enough to differentiate by finite differences."""
 
 from typing import Any
 
@@ -30,12 +30,12 @@ def weighting_of(case: str) -> Weighting:
 
 
 def begin(weighting: Weighting, shared: Any) -> Any:
-    """The state of a weighting of `NAMES`, all of whose parameters are shared."""
+    """Return the initial state of a weighting of `NAMES` for parameters that are all shared."""
     return weighting.init(NAMES, shared, *((shared,) if weighting.hold is not None else ()))
 
 
 def problem(seed: int = 0, size: int = 12) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Parameters of an encoder and three heads, and a minibatch, as float64."""
+    """Sample parameters of an encoder and three heads, and a minibatch of ``size`` examples, as float64."""
     random = np.random.default_rng(seed)
     encoder = {"kernel": random.normal(size=(5, 4)), "bias": random.normal(size=4)}
     heads = {"main": random.normal(size=4), "near": random.normal(size=(4, 2)), "far": random.normal(size=(4, 3))}
@@ -52,7 +52,7 @@ def losses_of_latents(params: Any, latent: Any, batch: Any, module: Any = jnp) -
 
 
 def losses_of(params: Any, batch: Any, module: Any = jnp) -> dict[str, Any]:
-    """Mean squared errors of three linear heads on one encoder, in JAX or in NumPy."""
+    """Compute the mean squared errors of three linear heads on one encoder, in JAX or NumPy (``module``), by name."""
     return losses_of_latents(params, encode(params["encoder"], batch, module), batch, module)
 
 
@@ -65,7 +65,7 @@ def in_float32(tree: Any) -> Any:
 
 
 def encoder_gradients(params: Any, batch: Any) -> dict[str, np.ndarray]:
-    """The oracle: gradients of each loss with respect to the encoder, flat, by central differences in float64."""
+    """Compute reference gradients [P] float64 of each loss with respect to the encoder, flattened, by central differences."""
     leaves, structure = jax.tree.flatten(params["encoder"])
     found: dict[str, list[float]] = {name: [] for name in NAMES}
     for leaf in leaves:
@@ -94,7 +94,7 @@ def modes_of(weighting: Weighting) -> tuple[Any, ...]:
 
 
 def gradient_by(way: Any, weighting: Weighting, **options: Any) -> Any:
-    """`weighted_grad` of the problem, its latents told where they are needed."""
+    """Return `weighted_grad` of the problem in a mode of `MODES`, with the encoder for ``latents``."""
     if way != "latents":
         return weighted_grad(losses_of, weighting, encoder_of, way, **options)
     return weighted_grad(losses_of_latents, weighting, encoder_of, way, encode=encode, **options)

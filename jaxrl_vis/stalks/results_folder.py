@@ -83,7 +83,7 @@ def claim_folder(
         folders: Folders of pairs.
         calibrations: Calibration of each folder by name; None if there is none.
         about: Everything else that results depend on, as JSON.
-        begun: Whether the folder holds results.
+        begun: True if the folder holds results; if not, its request is replaced unchecked.
 
     Raises:
         RequestError: The folder holds the results of another request.

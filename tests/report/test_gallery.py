@@ -1,4 +1,4 @@
-"""`jaxrl-vis envs`: the table, at once, and the sheet of images."""
+"""Tests of `jaxrl-vis envs`: the table of environments, and the sheet of images."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +17,7 @@ from jaxrl_vis_envs import registry
 
 @pytest.fixture
 def own_environment() -> Iterator[str]:
-    """An environment of a user, registered for the length of a test."""
+    """Name of a user's environment, registered for the duration of a test."""
     registry.register("VisualPointMass", PointMass, PointMassConfig)
     yield "VisualPointMass"
     del registry._ENTRIES["VisualPointMass"]
@@ -81,7 +81,7 @@ def test_what_the_gallery_cannot_draw_is_told(tmp_path: Path, capsys: pytest.Cap
 def test_a_format_that_cannot_be_written_is_refused_before_the_work(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Pillow knows the first three, and only reads them, or writes no colours: it said so after the drawing."""
+    """Pillow cannot write colour images in the first three formats, but raises an error only after rendering."""
     assert cli.main(["envs", "VisualReacher", "--gallery", str(tmp_path / name)]) == 2
     assert "end its name in .png or .jpg" in capsys.readouterr().err and not list(tmp_path.iterdir())
 

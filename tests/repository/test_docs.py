@@ -1,4 +1,4 @@
-"""The README and the pages of docs/: their code runs, their commands parse, their tables and links hold, their site builds."""
+"""Tests of the README and docs/: code runs, commands parse, tables and links are valid, and the site builds."""
 
 import contextlib
 import dataclasses
@@ -53,7 +53,7 @@ def page_name(page: Path) -> str:
 
 @contextlib.contextmanager
 def small_settings() -> Iterator[None]:
-    """Everything that is trained is trained by the smallest preset, in one program that is traced once."""
+    """Train with the smallest preset instead of any other within the context, in one program that is traced once."""
     full_preset = config.preset
 
     def small_preset(name: str, **overrides: Any) -> Config:
@@ -68,7 +68,7 @@ def small_settings() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder with a trained run in it, runs/mine. While it is used, all that is trained is small."""
+    """Folder with a trained run, runs/mine; while it is in use, everything is trained with the smallest preset."""
     folder = tmp_path_factory.mktemp("desk")
     with small_settings():
         list(trainer.make_trainer(jaxrl_vis.preset("debug"), folder / "runs" / "mine").run())
@@ -77,7 +77,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture
 def reader(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The current folder of somebody who types what a page says: a copy of the desk. Tasks that are made in it go with it."""
+    """Current folder of a reader who types a page's code: a copy of the desk; modules and tasks from it are removed after."""
     shutil.copytree(desk, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -96,7 +96,7 @@ def reader(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
 
 
 def missing(what: str) -> bool:
-    """Returns True if a requirement in a mark is missing: a module, a name in one, or an option of `train`."""
+    """Return True if a requirement in a mark is missing: a module, a name in one, or an option of `train`."""
     if what.startswith("--"):
         return what[2:] not in {*OPTIONS, *(field.name for field in dataclasses.fields(Train))}
     module, _, name = what.rpartition(".")
@@ -121,7 +121,7 @@ def test_blocks_have_a_language_and_marks_are_true(page: Path) -> None:
 
 
 def save_file(block: Block) -> bool:
-    """Writes a block that begins with `# file: name` to that file; whether it is one."""
+    """Write a block that begins with `# file: name` to that file; return True if it did."""
     file = re.match(r"# file: (\S+)\n", block.text)
     if file:
         Path(file[1]).write_text(block.text)
@@ -129,7 +129,7 @@ def save_file(block: Block) -> bool:
 
 
 def run_block(page: Path, block: Block, names: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
-    """Executes a block after those before it, and checks what it says that it prints (`# (...)`, `# [...]`, `# about 1.0`)."""
+    """Execute a block in the namespace ``names``, and check prints against comments (`# (...)`, `# [...]`, `# about 1.0`)."""
     capsys.readouterr()
     if save_file(block):
         return
@@ -219,7 +219,7 @@ for figure in ("5.1", "5.4"):  # of no runs: status 3
 
 
 def read_keys(page: Path, name: str) -> list[str]:
-    """The first column of the table between the marks of that name."""
+    """Return the first column of the table between the marks with a name."""
     table = page.read_text().partition(f"<!-- {name}: begin -->")[2].partition(f"<!-- {name}: end -->")[0]
     return re.findall(r"^\| `([^`]+)`", table, re.MULTILINE)
 
@@ -380,7 +380,7 @@ def test_the_site_builds_and_loads_nothing_from_elsewhere(tmp_path: Path) -> Non
 
 
 def test_columns_of_the_site_are_wide_enough_to_read() -> None:
-    """Code that may break anywhere, beside cells that may not break at all, was set one letter a line."""
+    """Regression test: code that may break anywhere, beside cells that may not break, was set with one letter per line."""
     style = (DOCS / "site.css").read_text()
     assert not re.search(r"td[^{]*\{[^}]*nowrap", style)
     assert re.search(r"table:not\(\[class\]\) code \{[^}]*word-break: normal", style)

@@ -1,4 +1,4 @@
-"""The first cell of the notebooks: it installs the package where it is missing, and stops with one line where it cannot."""
+"""Tests of the notebooks' first cell: it installs the package if it is missing, or stops with one line if it cannot."""
 
 import importlib.util
 import json
@@ -26,7 +26,7 @@ CELL = first_cell(FOLDER / "01_quickstart.ipynb")
 
 @pytest.fixture
 def without_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A folder without a checkout beside it, in a Python that does not find the package."""
+    """Current folder without a checkout beside it, in a Python that does not find the package."""
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "jaxrl_vis" else found(name))
     monkeypatch.delenv("JAXRL_VIS_REPOSITORY", raising=False)
@@ -37,7 +37,7 @@ def without_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def fake_checkout(folder: Path, problem: str | None = None) -> Path:
-    """A checkout whose installer notes that it was called."""
+    """Create a checkout whose installer writes the file ``installed`` and returns ``problem``; return ``folder``."""
     (folder / "notebooks").mkdir(parents=True)
     (folder / "notebooks" / "install.py").write_text(
         f"def install(source):\n    open('installed', 'w').write(str(source))\n    return {problem!r}\n"
@@ -46,7 +46,7 @@ def fake_checkout(folder: Path, problem: str | None = None) -> Path:
 
 
 def stopped(cell: str) -> str:
-    """The line with which the cell stops."""
+    """Run the cell, and return the line with which it stops."""
     with pytest.raises(Exception) as caught:
         exec(cell, {})
     assert type(caught.value).__name__ == "Stop"
@@ -156,7 +156,7 @@ def test_the_extras_exist(checkout):
 
 @pytest.fixture
 def fake_pip(monkeypatch, tmp_path):
-    """What would be run, and what comes of it."""
+    """Recorded commands that would be run, and the return code and output that each gets, which tests may change."""
     calls, result = [], {"returncode": 0, "stdout": ""}
 
     def run(words, **options):

@@ -1,4 +1,4 @@
-"""Notebooks run from top to bottom on the smallest settings, and are committed without outputs."""
+"""Tests of the notebooks: they run from top to bottom with the smallest settings, and are committed without outputs."""
 
 import os
 from collections.abc import Iterator
@@ -51,7 +51,7 @@ def test_outputs_are_stripped(path: Path, nbformat: Any) -> None:
 
 @pytest.fixture(scope="module")
 def kernel(tmp_path_factory: pytest.TempPathFactory, nbclient: Any) -> Iterator[Any]:
-    """A kernel for all notebooks, so that modules are imported once; each begins without the names of the one before."""
+    """Kernel shared by all notebooks, so that modules are imported once; each begins without the names of earlier ones."""
     jupyter_client = pytest.importorskip("jupyter_client")
     checkout, ipython = Path(__file__).resolve().parents[2], tmp_path_factory.mktemp("ipython")
     startup = ipython / "profile_default/startup"

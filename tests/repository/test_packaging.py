@@ -1,4 +1,4 @@
-"""Imports run one way, and what is shipped works outside the checkout."""
+"""Tests of the direction of imports, and of the wheel outside the checkout."""
 
 import ast
 import fnmatch
@@ -52,11 +52,11 @@ PACKAGES = {"jaxrl_vis": (ROOT / "jaxrl_vis", LAYERS), "jaxrl_vis_envs": (ROOT /
 
 
 def imported(path: Path, when_running: bool = True) -> set[str]:
-    """Every module that a file imports, by full name; `from a import b` counts as a.b.
+    """Return the full names of all modules that a file imports; `from a import b` counts as a.b.
 
     Args:
         path: The file.
-        when_running: Leave out what is imported for type checkers only.
+        when_running: If true, leave out imports for type checkers only.
     """
     found = set()
     tree = ast.parse(path.read_text())
@@ -74,7 +74,7 @@ def imported(path: Path, when_running: bool = True) -> set[str]:
 
 
 def modules_of(package: str) -> dict[str, Path]:
-    """Files of a package by the full name of the module, less its own ``__init__``, whose names are looked up when used."""
+    """Return the files of a package by module name, without its own ``__init__``, whose names are imported lazily."""
     folder, _ = PACKAGES[package]
     parts = {path: path.relative_to(folder).with_suffix("").parts for path in folder.rglob("*.py")}
     return {
@@ -85,7 +85,7 @@ def modules_of(package: str) -> dict[str, Path]:
 
 
 def imports_within(package: str, when_running: bool) -> dict[str, set[str]]:
-    """Module -> modules of the same package that it imports."""
+    """Return, for each module of a package, the modules of the package that it imports; see `imported`."""
     modules = modules_of(package)
     graph: dict[str, set[str]] = {}
     for name, path in modules.items():
@@ -140,7 +140,7 @@ assert "jaxrl_vis.stalks" in sys.modules and not {"jax", "numpy", "cv2"} & set(s
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_no_imports_go_in_circles(package: str) -> None:
-    """Also among the files of a folder, and counting what is imported for types only, or inside functions."""
+    """Circles count among the files of a folder, too, and through imports for types only or inside functions."""
     sorter = graphlib.TopologicalSorter(imports_within(package, when_running=False))
     sorter.prepare()  # raises CycleError, which names the circle
 
@@ -158,7 +158,7 @@ def test_packages_do_not_import_the_scripts_outside_the_wheel() -> None:
 
 
 def test_the_scalar_engine_has_one_door() -> None:
-    """Nothing outside of its folder imports more than its two functions and the probe of its kernel."""
+    """Modules outside its folder import only its two functions and the probe of its kernel."""
     folder, door = ROOT / "envs" / "jaxrl_vis_envs" / "physics" / "scalar", "jaxrl_vis_envs.physics.scalar"
     for path in [*(ROOT / "jaxrl_vis").rglob("*.py"), *(ROOT / "envs").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.py")]:
         inside = {name.removeprefix(f"{door}.") for name in imported(path) if name.startswith(f"{door}.")}
@@ -187,7 +187,7 @@ assert not {"mujoco", "matplotlib", "orbax"} & set(sys.modules)
 
 
 def test_the_library_of_weightings_loads_jax_and_optax_alone(clean_environment: dict[str, str]) -> None:
-    """No command line, physics, networks or import hook: people with losses of their own need none of these."""
+    """Users with their own losses need no command line, physics, networks or import hook."""
     code = """
 import sys
 import jax, jax.numpy, jax.extend.core, numpy, optax
@@ -209,7 +209,7 @@ def test_importing_the_package_loads_no_jax(clean_environment: dict[str, str]) -
 
 
 def test_mjx_does_not_print_that_warp_is_missing(clean_environment: dict[str, str]) -> None:
-    """Neither in our own imports nor in those that come after them; what else is printed there is printed."""
+    """Neither importing our modules prints it, nor importing MJX after them."""
     for code in ("import jaxrl_vis_envs.physics; from mujoco import mjx", "import jaxrl_vis_envs.adapters.brax_viewer"):
         done = subprocess.run([sys.executable, "-c", code], env=clean_environment, capture_output=True, text=True)
         assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr
@@ -237,7 +237,7 @@ def test_mjx_loads_libraries_for_meshes_only_where_there_are_meshes(clean_enviro
 
 
 def test_importing_the_environments_changes_no_imports(clean_environment: dict[str, str]) -> None:
-    """Of MJX, which their physics makes faster; and loads no JAX."""
+    """Only their physics adds the import hook that makes MJX faster; the module of names loads no JAX."""
     code = (
         "import sys; finders = list(sys.meta_path); import jaxrl_vis_envs.names;"
         "assert sys.meta_path == finders and not {'jax', 'mujoco'} & set(sys.modules);"
@@ -305,7 +305,7 @@ def test_wheel_holds_both_packages_and_nothing_else(wheel: Path) -> None:
 
 
 def test_wheel_is_small(wheel: Path) -> None:
-    """Code grows with what it does; weights and images besides the policies only on purpose."""
+    """Limits on code, and on other files without the pretrained policies, are raised only on purpose."""
     sizes = {
         file.filename: file.compress_size for file in zipfile.ZipFile(wheel).infolist() if "/pretrained/" not in file.filename
     }

@@ -1,4 +1,4 @@
-"""Uses of other libraries' private parts are those of docs/private_apis.md."""
+"""Tests that the private APIs of other libraries in use are those listed in docs/private_apis.md."""
 
 import ast
 import re
@@ -14,14 +14,14 @@ _TEXT = re.compile(r"(_impl\.\w+|[\w.]+\._src\.[\w.]+|jaxlib\.[\w.]+|\.?orbax-ch
 
 
 def trees() -> dict[str, ast.Module]:
-    """The files of both packages, by their paths in the repository."""
+    """Return the syntax trees of the files of both packages, by path in the repository."""
     folders = (ROOT / "jaxrl_vis", ROOT / "envs" / "jaxrl_vis_envs")
     files = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
     return {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in files}
 
 
 def own_names(tree: ast.Module) -> Iterator[str]:
-    """Names that a file defines, attributes included."""
+    """Yield the names that a file defines, attributes included."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield node.name
@@ -32,7 +32,7 @@ def own_names(tree: ast.Module) -> Iterator[str]:
 
 
 def private_modules(node: ast.AST) -> Iterator[str]:
-    """What an import takes of private or unstable modules."""
+    """Yield the private or unstable modules, or names in them, that an import uses."""
     if isinstance(node, ast.Import):
         names = [(alias.name, alias.name) for alias in node.names]
     elif isinstance(node, ast.ImportFrom):
@@ -47,7 +47,7 @@ def private_modules(node: ast.AST) -> Iterator[str]:
 
 
 def uses(tree: ast.Module, own: set[str]) -> Iterator[str]:
-    """Private parts that a file uses: imports, attributes, and names in texts."""
+    """Yield the private APIs that a file uses: imports, attributes, and names in strings."""
     for node in ast.walk(tree):
         yield from private_modules(node)
         if isinstance(node, ast.Attribute) and re.match("_[a-z]", node.attr) and node.attr not in own | _OF_NAMED_TUPLES:
@@ -57,7 +57,7 @@ def uses(tree: ast.Module, own: set[str]) -> Iterator[str]:
 
 
 def rows() -> list[list[str]]:
-    """The cells of the page's tables, less their heads."""
+    """Return the cells of the page's tables, without their headers."""
     lines = [line for line in PAGE.read_text().splitlines() if line.startswith("| `")]
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
 

@@ -1,4 +1,4 @@
-"""Fixtures of the farm's tests."""
+"""Fixtures of the tests of stalk counting and measuring."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ def plots(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def results(plots: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `phenotype run` makes of them."""
+    """Results folder of `phenotype run` on these plots."""
     from phenotype_plots import run
 
     out = tmp_path_factory.mktemp("results") / "out"

@@ -1,8 +1,8 @@
-"""Records results of torchvision.ops for random boxes in data/torchvision_boxes.npz.
+"""Record results of torchvision.ops for random boxes in data/torchvision_boxes.npz.
 
     python tests/stalks/make_torchvision_boxes.py
 
-torchvision is no dependency: install it beside (2.15 and 0.29 were used), and run this once.
+torchvision is not a dependency: install it separately (2.15 and 0.29 were used), and run this once.
 """
 
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def main() -> None:
-    """Writes the file."""
+    """Write the file."""
     import torch  # pyright: ignore[reportMissingImports]
     from torchvision import ops  # pyright: ignore[reportMissingImports]
 

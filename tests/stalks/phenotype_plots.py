@@ -1,4 +1,4 @@
-"""What tests of ``phenotype run`` share: two small synthetic plots, and reading what became of them."""
+"""Helpers of the tests of ``phenotype run``: two small synthetic plots, the command, and its tables."""
 
 import csv
 import json
@@ -8,7 +8,7 @@ from jaxrl_vis import cli
 
 
 def write_plots(folder: Path) -> Path:
-    """Two plots of four pairs with true masks, small, and the file of their family beside them."""
+    """Write two small plots of four pairs with true masks, and their family beside them; return the folder of the plots."""
     spec = folder / "few.json"
     spec.write_text(json.dumps({
         "layout": {"rows_behind": 0, "stalks_mean": 5, "stalks_sd": 0, "tillers": 0, "plot_length": 0.5,

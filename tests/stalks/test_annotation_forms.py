@@ -1,4 +1,4 @@
-"""Annotations as programs export them, under their names and in their folders: the same two stalks, read from each."""
+"""Tests of annotations in the files and folders that programs export: each yields the same two stalks."""
 
 import base64
 import json
@@ -45,7 +45,7 @@ def voc(file_name: str, size: tuple[int, int] = (WIDTH, HEIGHT)) -> str:
 
 
 def turned(file_name: str) -> str:
-    """The second box is given as lying, and turned by a quarter of a turn."""
+    """Return roLabelImg XML, whose second box lies on its side and is rotated by a quarter turn."""
     boxes = ""
     for name, x, y, wide, high, angle in (
         ("stalk", 35, 45, 10, 70, 0.0),

@@ -1,4 +1,4 @@
-"""Calibrations in every form that programs print: the same cameras, read from each, and one line where a form cannot serve."""
+"""Tests of calibrations in all formats of programs: each yields the same cameras, or one line if it is unusable."""
 
 import json
 from pathlib import Path
@@ -188,7 +188,7 @@ def test_every_form_says_the_same_cameras(tmp_path, form):
 
 
 def test_calibrations_beside_images_are_found(tmp_path):
-    """Under the names that programs give them, and no other file is taken for one."""
+    """Calibrations are found under the names that programs give them, and no other file is mistaken for one."""
     none = put(tmp_path / "none", {"plot.json": "{}", "annotations.json": "{}", "odometry.csv": "", "notes.txt": ""})
     assert find_calibration(none) is None
     for form in ("stereo_calib of OpenCV", "rostopic echo", "cam0 and cam1", "Middlebury", "KITTI, raw data"):
@@ -198,7 +198,7 @@ def test_calibrations_beside_images_are_found(tmp_path):
 
 
 def test_binning_and_regions_of_interest(tmp_path):
-    """As image_geometry applies them: the region first, then its pixels put together."""
+    """The order is that of ROS's image_geometry: the region is cut out first, then its pixels are binned."""
     folder = put(tmp_path, {"left.yaml": ros2(0.0, 2), "right.yaml": ros2(-50.0, 2)})
     assert read_calibration(folder) == Calibration(320, 240, 250.0, (159.75, 119.75), 0.1)
     region = (40, 20, 200, 400)
@@ -207,7 +207,7 @@ def test_binning_and_regions_of_interest(tmp_path):
 
 
 def test_offsets_of_middlebury_keep_their_sign(tmp_path):
-    """Depth is baseline times focal length over disparity plus doffs, by the data set's own words."""
+    """By the data set's definition, depth is baseline times focal length over the sum of disparity and doffs."""
     text = MIDDLEBURY.replace("cam1=[500 0 319.5", "cam1=[500 0 340.5").replace("doffs=0", "doffs=21")
     found = read_calibration(put(tmp_path, {"calib.txt": text}))
     assert found.depth(np.array([79.0])) == pytest.approx(0.1 * 500 / (79.0 + 21.0))
@@ -224,7 +224,7 @@ def test_the_folders_of_images_say_which_pair_of_kitti(tmp_path):
 
 
 def test_the_coloured_pair_of_kitti(tmp_path):
-    """Both of its cameras stand beside the first grey one, and not quite at one height."""
+    """Both cameras are offset from the first greyscale one, horizontally and slightly vertically."""
     rows = "{0} 721.5377 0 609.5593 {1} 0 721.5377 172.854 {2} 0 0 1 {3}\n"
     text = rows.format("P2:", 44.85728, 0.2163791, 0.002745884) + rows.format("P3:", -339.5242, 2.199936, 0.002729905)
     found = read_calibration(put(tmp_path, {"calib.txt": text}) / "calib.txt", None, image(tmp_path, (1242, 375)))

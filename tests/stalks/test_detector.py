@@ -1,4 +1,4 @@
-"""The networks that find and outline stalks: operators against torchvision's, codes, crops, training and files of weights."""
+"""Tests of the detection and segmentation networks: operators against torchvision's, box offsets, crops, training, weights."""
 
 import dataclasses
 from pathlib import Path
@@ -42,7 +42,7 @@ assign_boxes, non_maximum_suppression, augment_geometry = (
 
 @jax.jit
 def nms(boxes, scores, threshold, valid=None):
-    """Non-maximum suppression of boxes [N, 4] by intersection over union, as torchvision's."""
+    """Apply non-maximum suppression to boxes [N, 4] by intersection over union, as torchvision does."""
     return non_maximum_suppression(box_iou(boxes, boxes), scores, threshold, valid)
 
 
@@ -65,7 +65,7 @@ def test_roi_align_is_torchvisions(aligned):
 
 
 def test_a_region_leans_as_its_stalk():
-    """In features that say their column, each line of the grid is moved as the middle of a box is that leans."""
+    """In features that hold their coordinates, each row of the grid is shifted by the lean of its box."""
     lines, columns = jnp.meshgrid(jnp.arange(40.0), jnp.arange(60.0), indexing="ij")
     features = jnp.stack([lines, columns], axis=-1)
     boxes, lean = jnp.array([[20.0, 10.0, 28.0, 30.0], [30.0, 4.0, 38.0, 24.0]]), jnp.array([10.0, -5.0])
@@ -84,7 +84,7 @@ def test_what_is_not_there_suppresses_nothing():
 
 
 def test_parallel_stalks_that_lean_are_two():
-    """Their boxes overlap by more than half, the strips that they are do not at all; the same stalk twice does."""
+    """Their boxes overlap by more than half, but their strips hardly do; strips of the same stalk, detected twice, do."""
     first = [0.0, 0.0, 40.0, 135.0, 35.0, 5.0]
     beside = [12.0, 2.0, 52.0, 137.0, 47.0, 17.0]
     again = [1.0, 3.0, 41.0, 138.0, 36.0, 6.0]
@@ -96,7 +96,7 @@ def test_parallel_stalks_that_lean_are_two():
 
 
 def test_a_stalk_that_two_finds_outline_is_one():
-    """Whatever their masks have around them; what was taken away takes nothing away, and stalks that cross are two."""
+    """Crops may differ; a suppressed detection suppresses no other, and crossing stalks are two."""
     image = np.zeros((120, 100), np.float32)
 
     def piece(top, left, mask):
@@ -145,7 +145,7 @@ def test_proposals_are_the_best_anchors_and_no_copies():
 
 
 def test_copies_of_a_stalk_leave_room_for_another():
-    """Another may lean across it: their boxes overlap by most of them, their strips do not."""
+    """A stalk that leans across another is among the proposals if there are enough candidates."""
     easy, hard = jnp.array([20.0, 10.0, 40.0, 40.0, 22.0, 38.0]), jnp.array([20.0, 10.0, 40.0, 40.0, 38.0, 22.0])
     anchors = jnp.concatenate([jnp.tile(easy, (99, 1)), hard[None]])
     logits = jnp.linspace(5.0, 1.0, len(anchors))
@@ -200,7 +200,7 @@ def test_smaller_images_have_smaller_crops():
 
 
 def drawing(seed: int) -> Example:
-    """A bright stalk on a dark image."""
+    """Return an example of a bright stalk on a dark image."""
     rng = np.random.default_rng(seed)
     image = rng.integers(0, 40, (60, 64, 3)).astype(np.uint8)
     top, bottom = rng.uniform(20, 44, 2)
@@ -219,7 +219,7 @@ def drawing(seed: int) -> Example:
 
 
 def test_stalks_move_with_their_images():
-    """Where the image is bright after it was moved, there the stalk is; some images are narrower than others."""
+    """After augmentation, the stalk lies where the image is bright; some images are narrower than others."""
     examples = [drawing(seed) for seed in range(8)]
     images = np.zeros((8, 64, 64, 3), np.uint8)
     images[:, :60] = [each.image for each in examples]
@@ -245,7 +245,7 @@ def test_stalks_move_with_their_images():
 
 
 def test_images_of_several_sizes_are_batched_together():
-    """A larger image that comes late makes batches larger; crops of a batch are of one size."""
+    """A larger image that arrives late enlarges the batches; all crops of a batch have one size."""
     plan = Plan(images=26, first=24, batch=16, crops=4)
     small, large = drawing(0), drawing(1)
     large = dataclasses.replace(
@@ -277,7 +277,7 @@ def trained():
 
 
 def test_networks_learn_to_find_and_outline(trained, tmp_path):
-    """One bright stalk in each image: what is found first lies on it, and the mask is nearly its mask. Also from a file."""
+    """In images of one bright stalk, the best detection and its mask overlap it, with weights read back from a file."""
     params, steps, said = trained
     assert steps == 160 and said[0][0] == 8
     assert np.mean([sum(losses.values()) for _, losses in said[-4:]]) < 0.6 * sum(said[0][1].values())
@@ -314,7 +314,7 @@ def test_a_training_without_time_for_an_update_is_told():
 
 
 def test_masks_of_crops_are_cut_out_of_what_each_pixel_shows():
-    """Also of the stalk with index 0, and at the image's edge, beyond which there is nothing."""
+    """Masks include that of the stalk with index 0, and are False beyond the image's edge."""
     instance = jnp.asarray(np.repeat(np.arange(32) // 8 - 1, 40).reshape(32, 40).T, jnp.int32)  # [40, 32], -1 to 2
     places = np.array([[8.0, 4, 16, 36, 10, 14], [16, 4, 24, 36, 20, 20], [24, -10, 32, 30, 30, 30]])
     masks = _instance_masks(instance, np.array([0, 1, 2]), np.arange(3), places, (48, 16))
@@ -337,7 +337,7 @@ def test_synthetic_examples_hold_crops_around_both_heights():
 
 
 def test_crops_are_varied_and_their_masks_stay_with_them():
-    """A bright strip on black ground: whatever is done to it, it is where its mask is, and the ground stays dark."""
+    """A bright strip on black stays where its mask is, and its surroundings stay dark."""
     crops, masks = np.zeros((24, 64, 48, 3), np.uint8), np.zeros((24, 64, 48), bool)
     crops[:, :, 14:30], masks[:, :, 14:30] = 150, True
     varied, moved = map(np.asarray, augment_crops(jnp.asarray(crops), jnp.asarray(masks), jax.random.key(0)))
@@ -376,7 +376,7 @@ def test_weights_whose_numbers_meant_something_else(tmp_path):
 
 
 def test_annotations_of_ones_own(tmp_path):
-    """Boxes without masks, polygons: all give stalks; anchors are as large as the boxes."""
+    """Boxes without masks and polygons both give stalks; anchors are as large as the boxes."""
     import json
 
     import cv2
@@ -406,7 +406,7 @@ def test_annotations_of_ones_own(tmp_path):
 
 
 def test_annotations_of_voc_and_labelme_are_those_of_coco(tmp_path):
-    """The same box in three formats; what is not called a stalk is left out; runs may be text."""
+    """Both yield the same box in COCO format; labels other than stalk are left out."""
     import json
 
     (tmp_path / "voc").mkdir()
@@ -441,7 +441,7 @@ def test_annotations_of_voc_and_labelme_are_those_of_coco(tmp_path):
 
 
 def test_runs_that_are_text():
-    """As pycocotools wrote those of a 2 x 3 image whose middle column is set, and of longer runs."""
+    """Runs of a 2 x 3 image whose middle column is set, and longer ones, are decoded as written by pycocotools."""
     assert decode_counts("222") == [2, 2, 2]
     assert decode_counts("`1m1S3XNSO") == [48, 61, 99, 5, 70]
     with pytest.raises(ValueError, match="middle of a number"):

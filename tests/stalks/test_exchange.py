@@ -1,4 +1,4 @@
-"""Results of plots joined with the plan of a field, in the forms that breeders' programs read."""
+"""Tests of the export of plot results, joined with a field plan, in formats of breeding software."""
 
 import csv
 import json
@@ -104,7 +104,7 @@ def test_miappe_has_what_its_checklist_asks_for(tmp_path):
 
 
 def test_plantcv_is_as_its_own_reader_walks_through_it(tmp_path):
-    """plantcv.utils.json2csv: variables have a category and a type; entities have metadata by name, observations by sample."""
+    """As plantcv.utils.json2csv expects, variables have category and type, and entities metadata and observations by sample."""
     assert write(tmp_path, "plantcv") == "plantcv.json"
     data = json.loads((tmp_path / "plantcv.json").read_text())
     kinds = {"<class 'int'>": int, "<class 'float'>": float, "<class 'str'>": str}
@@ -179,7 +179,7 @@ def test_plans_that_cannot_be_joined_are_told_in_one_line(tmp_path, text, part):
 
 @given(st.permutations(range(1, 9)), st.integers(1, 8))
 def test_no_plot_gets_the_row_of_another(tmp_path_factory, order, count):
-    """Whatever the order of rows, and which of them are there."""
+    """The order of rows, and missing or further rows, make no difference."""
     path = tmp_path_factory.mktemp("plan") / "plan.csv"
     path.write_text("plot,genotype\n" + "".join(f"{number},G{number}\n" for number in order))
     plots = [f"plot_{number:04d}" for number in range(1, count + 1)]

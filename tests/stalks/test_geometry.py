@@ -1,4 +1,4 @@
-"""The same stalks by other lenses, in crops, with borders, upside down, and by a calibration in another unit."""
+"""Tests of stalks seen by other lenses, in crops, with borders, upside down, and with a calibration in another unit."""
 
 import dataclasses
 import functools
@@ -65,7 +65,7 @@ def test_images_are_resized_by_the_focal_length_and_not_by_their_width():
     ("lines", "kept", "added"), [(676, 676, 0), (620, 620, 0), (740, 740, 0), (1127, 676, -226), (407, 676, 134)]
 )
 def test_images_of_other_views_get_the_lines_that_networks_know(lines, kept, added):
-    """The middle of a wide lens's image; a long lens's image between black lines."""
+    """A wide lens's image is cropped to its middle rows; a long lens's image gets black rows above and below."""
     image = np.repeat(np.arange(1, lines + 1)[:, None, None], 40, axis=1) * np.ones(3, int)
     usual, above = pad_to_training_height(image, Settings())
     assert usual.shape == (kept, 40, 3) and above == added
@@ -91,7 +91,7 @@ def test_images_of_other_views_get_the_lines_that_networks_know(lines, kept, add
     ],
 )
 def test_lenses_that_were_not_tried_are_told(focal, size, distance, told):
-    """By pixels per metre and the view, whatever camera or distance they come from."""
+    """Resolution and field of view at the plants decide, whatever camera or distance they result from."""
     width, height = size
     camera = Calibration(width, height, focal, (0.5 * (width - 1), 0.5 * (height - 1)), 0.1)
     fault = lens_fault(camera, distance, camera.height)
@@ -103,7 +103,7 @@ def test_lenses_that_were_not_tried_are_told(focal, size, distance, told):
 
 
 def test_widths_do_not_depend_on_crops_borders_and_lenses():
-    """One pair of the sample row: letterboxed, cropped, and as a lens of 1.66 times the focal length shows it."""
+    """One pair of the sample row is letterboxed, cropped, and enlarged as by a lens of 1.66 times the focal length."""
     left, right, camera = sample()
     finder = load_finder(SHIPPED, 0.5)
 
@@ -134,7 +134,7 @@ def test_widths_do_not_depend_on_crops_borders_and_lenses():
 
 
 def stalks_at(disparity: int) -> tuple[np.ndarray, np.ndarray, list[Detection]]:
-    """A pair of six stalks with a texture, and what a perfect finder says of it."""
+    """Return a pair of six textured stalks at a disparity, and the detections of a perfect detector."""
     rng = np.random.default_rng(0)
     left, right = (rng.integers(0, 20, (400, 844, 3)).astype(np.uint8) for _ in range(2))
     finds = []
@@ -152,7 +152,7 @@ def stalks_at(disparity: int) -> tuple[np.ndarray, np.ndarray, list[Detection]]:
 
 @pytest.mark.parametrize(("disparity", "sizes"), [(68, [0.8]), (50, [0.8, 0.55, 1.15]), (97, [0.8, 0.55])])
 def test_a_row_elsewhere_is_looked_for_at_the_size_that_it_has_there(disparity, sizes):
-    """Networks find nothing where stalks have another size; where the row stands is not known before."""
+    """A detector that detects stalks of one size only is called with other scales until the stereo distance confirms one."""
     left, right, finds = stalks_at(disparity)
     asked = []
 
@@ -166,7 +166,7 @@ def test_a_row_elsewhere_is_looked_for_at_the_size_that_it_has_there(disparity, 
 
 
 def test_the_field_of_a_crop_is_its_own():
-    """A stalk that a crop beside the axis shows once is not missed in pairs that cannot show it."""
+    """A stalk that a crop beside the optical axis shows once is not expected in pairs that cannot show it."""
     narrow = dataclasses.replace(CAMERA, width=200, centre=(-300.0, 199.5))
     frames = [[Sighting((0, 0, 1, 1), (0, 0), 1.0, 200.0, 100.0, diameter_mm=14.0, depth_m=0.8, along_m=0.54)]]
     frames += [[] for _ in range(8)]
@@ -183,7 +183,7 @@ def test_the_field_of_a_crop_is_its_own():
 
 
 def test_a_row_that_is_not_seen_as_a_whole_has_no_count():
-    """Nobody knows how many stalks stand where no pair looked; a mean of widths that few pairs measured says so."""
+    """A plot of which no pair shows a part has no count; widths measured in few pairs are flagged."""
     find = Sighting((0, 0, 1, 1), (0, 0), 1.0, 200.0, 100.0, diameter_mm=14.0, depth_m=0.8, along_m=0.4, height_m=0.3048)
     track = Track(((0, 0),), 0.4, 0.8, True, "")
     origin = Origin("plot", "strip", "0")
@@ -201,7 +201,7 @@ def test_a_row_that_is_not_seen_as_a_whole_has_no_count():
 
 
 def scene(kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """A noisy image with wedges and bars around it, and where these are."""
+    """Return a noisy image [240, 320, 3] uint8 with black wedges and a bar around it, and their mask [240, 320]."""
     rng = np.random.default_rng(1)
     image = cv2.GaussianBlur(rng.integers(30, 255, (240, 320, 3)).astype(np.float32), (0, 0), 2.0).astype(np.uint8)
     line, column = np.mgrid[:240, :320]
@@ -227,7 +227,7 @@ def test_borders_are_found_and_filled(kind):
 
 
 def test_dark_scenes_have_no_borders():
-    """A night behind stalks, with the noise of a camera; black leaves at the side; a stalk whose side is straight."""
+    """A noisy night sky behind a stalk, black leaves at the side, and an entirely black image have no borders."""
     rng = np.random.default_rng(2)
     night = np.abs(rng.normal(0.0, 3.0, (240, 320, 3))).astype(np.uint8)
     night[150:] = rng.integers(40, 200, (90, 320, 3))
@@ -284,7 +284,7 @@ def test_pairs_upside_down_are_told():
 
 @pytest.mark.parametrize(("baseline", "distance"), [(0.01, "0.08"), (1.0, "8"), (0.0417, "0.33")])
 def test_a_row_that_stands_nowhere_is_told(baseline, distance):
-    """The chessboard was measured in another unit than is said: 10 times, a tenth, and squares of 24 mm taken for 1 cm."""
+    """Baselines are wrong by the unit of the chessboard: ten times, a tenth, and squares of 24 mm taken for 1 cm."""
     left, right, finds = stalks_at(68)
     wrong = dataclasses.replace(CAMERA, baseline=baseline)
     told = pair_fault(finds, measure_pair(finds, left, right, wrong), left, right, wrong)
@@ -292,7 +292,7 @@ def test_a_row_that_stands_nowhere_is_told(baseline, distance):
 
 
 def test_what_the_right_image_does_not_reach_has_no_depth():
-    """Where the leftmost stalk would be, the right image ends; what is like it there would stand 1.2 m away."""
+    """The right image ends before the leftmost stalk; a match with a similar texture would put it 1.2 m away."""
     left, right, finds = stalks_at(68)
     left, right = left[:, 65:], right[:, 65:].copy()
     right[:, 10:24] = left[:, 55:69]

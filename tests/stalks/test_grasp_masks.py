@@ -1,4 +1,4 @@
-"""Grasping: the networks that paint stalks."""
+"""Tests of the networks that mask stalks for grasping."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ from jaxrl_vis.stalks.grasping.perception.cloud import redness
 
 
 def striped(seed: int) -> Example:
-    """A dark image with bright upright stripes, which are its stalks."""
+    """Return an example of a dark image with bright upright stripes, which are its stalks."""
     rng = np.random.default_rng(seed)
     mask = np.zeros((64, 96), bool)
     for column in rng.integers(4, 88, 4):

@@ -1,4 +1,4 @@
-"""Arms among stalks: kinematics, what bends, what a grasp holds, and the ways that lead there."""
+"""Tests of arms among stalks: kinematics, bending, grasps, and the control loops."""
 
 import dataclasses
 import functools
@@ -193,7 +193,7 @@ def test_a_stand_of_nothing_is_refused_in_one_line():
 
 
 def test_a_stalk_gives_way_like_a_beam():
-    """Pushed at several heights in C MuJoCo, against 3 EI / z^3 of a beam without taper."""
+    """Its stiffness at several heights z, in C MuJoCo, agrees with 3 EI / z^3 of a beam without taper."""
     arms, radius = build_arm_model(4), 0.006
     model = arms.mj_model.__copy__()
     shape = jax.tree.map(lambda part: part[0], bending.shapes(stands()))
@@ -364,7 +364,7 @@ def test_a_policy_drives_the_arm_and_its_goals_are_of_what_was_found():
 
     @dataclasses.dataclass(frozen=True, eq=False)
     class Onwards:
-        """Drives straight ahead, to the end of where the grip may be driven, and keeps its goal."""
+        """Policy that moves the grip straight ahead, and records its observations and goals."""
 
         env: StalkReach
 

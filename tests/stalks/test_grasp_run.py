@@ -1,4 +1,4 @@
-"""Grasping: the command, on good and on bad input."""
+"""Tests of `grasp run` on good and bad input."""
 
 import dataclasses
 import json
@@ -44,7 +44,7 @@ def spec(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def runs(spec) -> Path:
-    """Two runs of three small pairs."""
+    """Folder of two synthetic runs of three small pairs."""
     folder = spec.parent / "runs"
     assert cli.main(["grasp", "synth", str(folder), "--spec", str(spec), *WIDTH, "--runs", "2"]) == 0
     return folder

@@ -1,4 +1,4 @@
-"""The metric of grasps: one target, one stalk."""
+"""Tests of the score of grasps: one target, one stalk."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Grasping: clouds and their stitches, and grasp points."""
+"""Tests of point clouds, their stitching, and grasp points."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ MOUNT = Mount()
 
 
 def turned(angles: tuple[float, float, float], shift: tuple[float, float, float]) -> Motion:
-    """A motion by angles about the axes in degrees and a shift in m."""
+    """Return a motion by angles about the x, y and z axes, degrees, and a shift, m."""
     rotation = np.eye(3)
     for axis, angle in enumerate(np.radians(angles)):
         one = np.eye(3)
@@ -34,7 +34,7 @@ def turned(angles: tuple[float, float, float], shift: tuple[float, float, float]
 
 
 def thicket(count: int = 12000) -> np.ndarray:
-    """Points [N, 3] on vertical stalks and on a few leaves of 1.6 m of row, m."""
+    """Sample points [N, 3] on vertical stalks and a few leaves along 1.6 m of a row, m."""
     rng = np.random.default_rng(0)
     foot = np.stack([np.linspace(-0.8, 0.8, 25) + rng.normal(0, 0.015, 25), 0.55 + rng.normal(0, 0.03, 25)], axis=1)
     which = rng.integers(25, size=count)
@@ -154,14 +154,14 @@ def seen(
     bend: float = 0.0,
     taper: float = 0.0,
 ) -> Cloud:
-    """What one pair sees of stalks: x and y of their feet, and lean along the row in m per m; 14 mm thick at 0.75 m, m.
+    """Return the cloud of one pair that shows stalks, 14 mm thick at a height of 0.75 m.
 
     Args:
-        stalks: In the robot frame of the last pair.
-        driven: How far the robot still has to drive until then.
-        hidden: Heights between which nothing is seen.
-        bend: Of all stalks, along the row, per m.
-        taper: By how much they are thicker for each m upwards, m.
+        stalks: x and y of each foot in the robot frame of the last pair, m, and lean along the row, m per m of height.
+        driven: Distance that the robot drives from this pair to the last one, m.
+        hidden: Range of heights that is occluded, m.
+        bend: Quadratic coefficient of x in the height of all stalks, 1/m.
+        taper: Change of the diameter per m of height.
     """
     pose = MOUNT.pose
     depth = np.full((320, 320), np.nan, np.float32)
@@ -203,7 +203,7 @@ def test_a_line_per_stalk_in_spite_of_what_hides_it():
 
 
 def test_lines_bend_and_taper_as_the_stalks_do():
-    """A straight line would be 19 mm beside them at 0.45 m, and 11 mm at 1.05 m."""
+    """Straight lines would be 19 mm off the stalks at 0.45 m, and 11 mm at 1.05 m."""
     bend, taper = -0.12, -0.012
     clouds = [
         seen(STALKS, far, hidden=hidden, bend=bend, taper=taper) for far, hidden in ((0.1, (0.5, 0.7)), (0.05, (9.0, 9.0)))
@@ -222,14 +222,14 @@ def test_lines_bend_and_taper_as_the_stalks_do():
 
 
 def both(one: Cloud, other: Cloud) -> Cloud:
-    """What a pair sees of what is in two clouds."""
+    """Return the cloud of a pair that shows the stalks of two clouds: at each pixel, the nearer one."""
     depth = np.fmin(*(np.where(cloud.mask, cloud.depth, np.float32(np.nan)) for cloud in (one, other)))
     red = np.isfinite(depth)
     return build_cloud(CAMERA.disparity(np.where(red, depth, np.float32(0.9))).astype(np.float32), red, CAMERA, MOUNT)
 
 
 def test_stalks_beside_each_other_in_one_pair_are_two():
-    """Their grasp points are so far apart in height that the lines alone could be of one stalk."""
+    """Their grasp points differ so much in height that, by the lines alone, they could be one stalk."""
     left, right = (0.0, 0.55, 0.0), (0.021, 0.55, 0.0)
     drives = (0.1, 0.05, 0.0)
     clouds = [both(seen([left], far, hidden=(0.6, 9.0)), seen([right], far, hidden=(0.0, 0.48))) for far in drives]

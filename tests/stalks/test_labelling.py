@@ -1,4 +1,4 @@
-"""Proposals of annotations: outlines, COCO and LabelMe, and nothing that is there is lost."""
+"""Tests of proposed annotations: outlines, COCO and LabelMe, and existing files, which are never lost."""
 
 import json
 
@@ -22,7 +22,7 @@ SIZE = (120, 100)
 
 @pytest.fixture
 def leaning() -> tuple[Detection, np.ndarray]:
-    """A find of a leaning strip of 9 pixels, whose crop goes on beyond its box, and its mask within the box."""
+    """Return a detection of a leaning strip 9 pixels wide, whose crop extends beyond its box, and its mask within the box."""
     mask = np.zeros(SIZE, bool)
     for line in range(SIZE[0]):
         mask[line, 40 + line // 5 : 49 + line // 5] = True

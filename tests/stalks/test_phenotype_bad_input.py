@@ -1,4 +1,4 @@
-"""What becomes of bad files and of commands that were stopped: one line each, and nothing is lost."""
+"""Tests of bad files and interrupted commands: each gives one line, and nothing is lost."""
 
 import json
 import os
@@ -48,7 +48,7 @@ def test_bad_files_are_listed_and_skipped(plots, tmp_path, capsys):
 
 
 def test_swapped_and_unrectified_pairs_are_told():
-    """Six stalks with a texture; the right image as it is, exchanged, and too low."""
+    """The right image of six textured stalks is unchanged, exchanged for the left one, too low, and too high."""
     rng = np.random.default_rng(0)
     camera = Calibration(844, 400, 542.0, (421.5, 199.5), 0.1)
     disparity = 68
@@ -127,7 +127,7 @@ def test_a_run_that_was_stopped_gives_the_same_tables(plots, results, tmp_path, 
 
 
 def test_what_is_put_back_is_counted_and_drawn(plots, results, tmp_path, capsys):
-    """The same command, once a missing image and the odometry are there: tables and overlays as if they had always been."""
+    """Once a missing image and the odometry are added, tables and overlays are as if they had never been missing."""
     plot, out = tmp_path / "plot_0000", tmp_path / "out"
     shutil.copytree(plots / "plot_0000", plot)
     (plot / "right_001.png").unlink()
@@ -153,7 +153,7 @@ def test_what_is_put_back_is_counted_and_drawn(plots, results, tmp_path, capsys)
 
 
 def test_what_messages_advise_may_follow_in_the_same_folder(plots, tmp_path, capsys):
-    """A calibration after a run without; and another finder after one that found nothing."""
+    """A calibration may be added after a run without one, and a request without results may be changed."""
     plot, out = tmp_path / "plot_0000", tmp_path / "out"
     shutil.copytree(plots / "plot_0000", plot)
     shutil.move(plot / "calibration.yaml", tmp_path)
@@ -203,7 +203,7 @@ def test_odometry_that_contradicts_the_images_gives_no_count(plots, results, tmp
 
 
 def test_stalks_without_a_single_width_are_told(plots, results, tmp_path, capsys):
-    """Their records say that none could be measured; the plot is not ok."""
+    """A plot is flagged if, by the records of its pairs, no stalk could be measured."""
     out = tmp_path / "out"
     shutil.copytree(results, out)
     for path in (out / "pairs" / "plot_0000").glob("*.json"):
@@ -218,7 +218,7 @@ def test_stalks_without_a_single_width_are_told(plots, results, tmp_path, capsys
 
 
 def test_a_run_that_was_killed_gives_the_same_tables(plots, results, tmp_path, clean_environment):
-    """SIGKILL after the first pairs, and the command again."""
+    """The command is killed by SIGKILL after the first pairs, and run again."""
     out = tmp_path / "out"
     words = ["phenotype", "run", str(plots), "--out", str(out), "--masks", "truth"]
     program = subprocess.Popen([sys.executable, "-m", "jaxrl_vis", *words], env=clean_environment, stdout=subprocess.DEVNULL)
@@ -236,7 +236,7 @@ def test_a_run_that_was_killed_gives_the_same_tables(plots, results, tmp_path, c
 
 
 def test_a_plot_whose_name_is_not_utf8_is_measured_to_the_end(plots, results, tmp_path, capsys):
-    """As an archive of another system leaves it; OpenCV, which writes it on each overlay, does not survive such a text."""
+    """Archives of other systems contain such names; OpenCV, which writes them on overlays, would crash."""
     plot = tmp_path / os.fsdecode(b"=t\xe9t\xe9")
     shutil.copytree(plots / "plot_0000", plot)
     os.rename(plot / "right_003.png", plot / os.fsdecode(b"r\xe9.png"))
@@ -249,7 +249,7 @@ def test_a_plot_whose_name_is_not_utf8_is_measured_to_the_end(plots, results, tm
 
 
 def test_widths_without_ground_say_so(plots, tmp_path, capsys):
-    """Everything below 8 inches is cut off: stalks are counted, but nobody knows how high a width was taken."""
+    """With everything below 8 inches black, stalks are counted, but the heights of widths are unknown."""
     plot = tmp_path / "plot_0000"
     shutil.copytree(plots / "plot_0000", plot)
     for path in [*plot.glob("left_*.png"), *plot.glob("right_*.png")]:
@@ -268,7 +268,7 @@ def test_widths_without_ground_say_so(plots, tmp_path, capsys):
 
 
 def test_nothing_seen_is_no_count(plots, tmp_path, capsys):
-    """It may be an empty plot, or a camera of which the networks know nothing."""
+    """The plot may be empty, or its camera may be unfamiliar to the networks."""
     plot = tmp_path / "plot_0000"
     shutil.copytree(plots / "plot_0000", plot)
     for path in (plot / "truth").glob("instance_*.png"):
@@ -282,7 +282,7 @@ def test_nothing_seen_is_no_count(plots, tmp_path, capsys):
 
 
 def test_a_lens_that_was_not_tried_gives_no_numbers(plots, tmp_path):
-    """Neither a count nor a width, and a line that says why, in the page, too; where masks are true, any lens will do."""
+    """There is neither a count nor a width, but a line with the reason, also in the page; with true masks, any lens will do."""
     (plot,) = find_plots(plots / "plot_0000")
     calibration = {plot.name: read_calibration(plots / "plot_0000" / "calibration.yaml")}
     said = {}
@@ -302,7 +302,7 @@ def test_a_lens_that_was_not_tried_gives_no_numbers(plots, tmp_path):
 
 
 def test_disparities_of_ones_own_take_the_right_images_place(plots, results, tmp_path):
-    """PFM beside the images, or 16 bits in a folder: widths as from our own matching, and no right image is needed."""
+    """With PFM files, or PNG of 16 bits, widths are as from our own matching, and no right image is needed."""
     true = plots / "plot_0000" / "truth"
     for kind in ("pfm", "png"):
         plot = tmp_path / kind / "plot_0000"
@@ -328,7 +328,7 @@ def test_disparities_of_ones_own_take_the_right_images_place(plots, results, tmp
 
 
 def test_the_page_holds_its_pictures_and_what_was_rejected(plots, results, tmp_path):
-    """No other file and no network; a row for each stalk; what is skipped is named, and names are escaped."""
+    """The page needs no other file or network, has a row for each stalk, states skipped pairs, and escapes names."""
     page = (results / "qc.html").read_text()
     stalks = table(results / "stalks.csv")
     assert page.count('<img class="stalk"') >= len(stalks) and page.count('<img class="pair"') == 8
@@ -344,7 +344,7 @@ def test_the_page_holds_its_pictures_and_what_was_rejected(plots, results, tmp_p
 
 
 def test_images_of_twelve_bits_in_sixteen(plots, results, tmp_path):
-    """As TIFF: the same stalks as from 8 bits."""
+    """TIFF images of 12 bits yield the same table of stalks as images of 8 bits."""
     plot = tmp_path / "plot_0000"
     shutil.copytree(plots / "plot_0000", plot)
     for path in [*plot.glob("left_*.png"), *plot.glob("right_*.png")]:

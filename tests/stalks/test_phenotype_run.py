@@ -1,4 +1,4 @@
-"""The command that counts and measures, on good and on bad input: its tables, its comparison with the truth, its figures."""
+"""Tests of the commands that count and measure: their tables, comparison with the ground truth, and figures."""
 
 import json
 from pathlib import Path
@@ -30,7 +30,7 @@ def test_run_counts_and_measures(plots, results):
 
 
 def test_several_processes_write_the_same(plots, results, tmp_path):
-    """However many look at pairs, and whichever pairs had been looked at before."""
+    """Results depend neither on the number of processes, nor on which results exist already."""
     out = tmp_path / "out"
     assert run(plots, out, "--workers", "2") == 0
     written = sorted(path.relative_to(results) for path in results.rglob("*") if path.is_file())

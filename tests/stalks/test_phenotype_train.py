@@ -1,4 +1,4 @@
-"""Training on annotated images: what it starts from, and what boxes alone do not change."""
+"""Tests of training on annotated images: initial weights, networks that boxes alone leave unchanged, sizes, and masks."""
 
 import dataclasses
 import json
@@ -26,7 +26,7 @@ from jaxrl_vis_envs.plants import Calibration
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three images with a bright stalk in each, and a box around its middle, 30 pixels tall."""
+    """Folder of three images with one bright stalk each, and a box 30 pixels tall around its middle."""
     folder = tmp_path_factory.mktemp("annotated")
     images, annotations = [], []
     for number in range(3):
@@ -54,7 +54,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def differences(one: Path, other: Path) -> dict[str, float]:
-    """The greatest change of any number of each network, but for the output layers, which start anew for sections."""
+    """Return the maximum change of any parameter of each network, without the output layers, which sections initialise anew."""
     first, second = read_weights(one)[0], read_weights(other)[0]
     for params in (first, second):
         params["detector"]["params"] = {
@@ -128,7 +128,7 @@ def test_boxes_of_another_size_start_from_random_weights_or_are_refused(folder, 
 
 
 def coco_folder(folder: Path, annotation: dict, image: dict | None = None) -> Path:
-    """A folder with one image of 64 x 60 pixels and one annotation."""
+    """Write one image of 64 x 60 pixels and one annotation to a folder, and return it."""
     about = {"id": 1, "file_name": "row.png", "width": IMAGE[1], "height": IMAGE[0], **(image or {})}
     cv2.imwrite(str(folder / "row.png"), np.full((*IMAGE, 3), 90, np.uint8))
     data = {"images": [about], "annotations": [{"id": 7, "image_id": 1, **annotation}]}
@@ -209,7 +209,7 @@ def test_wrong_annotations_of_voc_and_labelme_name_their_file(tmp_path):
 
 @pytest.mark.parametrize("kind", ["coco", "voc", "labelme"])
 def test_images_of_another_size_than_was_annotated_are_refused(tmp_path, kind):
-    """An image that was made ten times smaller after it was annotated."""
+    """The image was downscaled by a factor of ten after its annotation."""
     coco_folder(tmp_path, {"bbox": [100, 40, 100, 400]}, {"width": 640, "height": 600})
     if kind != "coco":
         (tmp_path / "annotations.json").unlink()
@@ -236,7 +236,7 @@ def test_a_box_that_is_not_there_is_the_one_around_the_mask(tmp_path, segmentati
 
 
 def test_a_calibration_gives_the_scale_of_annotated_images(tmp_path):
-    """Without one, images are reduced to one width, and so are those that the networks are used on."""
+    """Without a calibration, images are resized to one width, in training as in detection."""
     coco_folder(tmp_path, {"bbox": BOX})
     assert fit_settings(tmp_path, TINY).pixels_per_metre == 0.0
     usual = TINY.pixels_per_metre * 0.8
@@ -257,7 +257,7 @@ def test_a_calibration_gives_the_scale_of_annotated_images(tmp_path):
 
 
 def test_masks_of_strips_are_as_wide_as_the_strips():
-    """Random leaning strips: no pixel more on the mean, whose spread is what 100 lines leave of half a pixel at either edge."""
+    """Masks of random leaning strips are unbiased; their spread is that of rounding both edges in 100 rows."""
     rng = np.random.default_rng(0)
     errors = []
     for _ in range(300):
@@ -271,7 +271,7 @@ def test_masks_of_strips_are_as_wide_as_the_strips():
 
 
 def test_masks_of_outlines_agree_with_boxes_and_runs(tmp_path):
-    """A rectangle of 14 x 170 is 14 x 170 pixels, the same ones as a box of that size has, and as the runs of the truth."""
+    """A rectangle of 14 x 170 has the same pixels as a box of that size, and as true runs."""
     size = (200, 100)
     cv2.imwrite(str(tmp_path / "row.png"), np.full((*size, 3), 90, np.uint8))
     shapes = [{"label": "stalk", "points": [[30, 20], [44, 190]], "shape_type": "rectangle"}]

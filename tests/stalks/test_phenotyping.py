@@ -1,4 +1,4 @@
-"""Widths, disparities and files of the phenotyping application, on images whose truth is known."""
+"""Tests of widths, disparities and image files of the phenotyping application, on images with known ground truth."""
 
 import dataclasses
 import runpy
@@ -37,7 +37,7 @@ def test_strips_are_as_wide_as_they_are(lean, ratio, bound, soft):
 
 
 def test_ellipses_are_biased_as_their_mathematics_says():
-    """A strip of width w has the second moment w^2 / 12, an ellipse of that minor axis w^2 / 16: 2 / sqrt 3 too wide."""
+    """The variance across a strip of width w is w^2 / 12, that across an ellipse of minor axis w is w^2 / 16."""
     mask = STRIPS["ideal_strip"](39.0, 6.0, 8.0, (0.2, 0.1), False)
     widths = {fit: ellipse_width(mask, fit) for fit in ELLIPSE_FITS}
     assert widths["moments"] / 39.0 == pytest.approx(2.0 / np.sqrt(3.0), rel=0.005)
@@ -75,7 +75,7 @@ def test_leaves_and_nodes_do_not_change_a_strip():
 
 
 def test_a_sheath_elsewhere_does_not_matter_where_a_width_is_taken():
-    """A sheath of 1.5 pixels on either side from line 120 to 240; from line 330 on, a leaf hides one edge."""
+    """A sheath adds 1.5 pixels on either side in rows 120 to 240; from row 330 on, a leaf occludes one edge."""
     line = np.arange(400)[:, None]
     half = np.where((line >= 120) & (line < 240), 21.5, 20.0)
     mask = np.abs(np.arange(120)[None, :] - 60.3 - 0.05 * line) < half
@@ -90,7 +90,7 @@ def test_a_sheath_elsewhere_does_not_matter_where_a_width_is_taken():
 
 
 def blurred_stalk(left: float, right: float, texture: float = 0.0) -> np.ndarray:
-    """[200, 120] grey: a bright upright strip between two columns, seen through a lens, with noise."""
+    """Return a grey image [200, 120] float32 of a bright upright strip between two columns, with noise, blurred."""
     column = np.arange(120)[None] + np.zeros((200, 1))
     image = np.where((column > left) & (column < right), 150.0, 30.0)
     image += texture * np.random.default_rng(0).normal(size=image.shape)
@@ -99,7 +99,7 @@ def blurred_stalk(left: float, right: float, texture: float = 0.0) -> np.ndarray
 
 @pytest.mark.parametrize("wrong", [-1.6, -0.7, 0.0, 1.3])
 def test_edges_settle_where_the_image_changes(wrong):
-    """A mask that is too narrow or too wide on both sides, beside what is truly there; in a part of the image."""
+    """Edges of a mask that is too narrow or too wide on both sides, in a part of the image, move to the true edges."""
     image = blurred_stalk(40.5, 79.5, 20.0)
     mask = np.zeros((160, 80), bool)
     strip = fit_strip(mask | ((np.arange(80) > 20.5) & (np.arange(80) < 59.5)))
@@ -111,7 +111,7 @@ def test_edges_settle_where_the_image_changes(wrong):
 
 
 def test_edges_stay_where_the_image_shows_none():
-    """Nothing but noise, and a change that is too far away to be meant."""
+    """Uniform images, noise, and an edge that is too far away do not move edges."""
     mask = np.zeros((160, 80), bool)
     strip = fit_strip(mask | ((np.arange(80) > 20.5) & (np.arange(80) < 59.5)))
     assert strip is not None
@@ -123,7 +123,7 @@ def test_edges_stay_where_the_image_shows_none():
 
 
 def test_a_width_that_was_not_seen_where_it_is_asked_for_is_a_lower_bound():
-    """Most of a stalk's mask is as wide as the stalk; where something hides a part of it, the measurement says so."""
+    """At a height where a stalk is partially occluded, its width is that of the rest, and marked as such."""
     cameras = Calibration(240, 400, 1000.0, (120.0, 200.0), 0.1)
     mask = np.zeros((360, 80), bool)
     mask[:, 20:60] = True
@@ -160,7 +160,7 @@ def test_what_is_no_strip_has_no_width(mask):
 @pytest.mark.parametrize("lean", [0.0, 0.3])
 @pytest.mark.parametrize("place", [(0.0, 0.0), (0.25, -0.1)])
 def test_diameters_are_those_of_the_cylinder_that_was_seen(lean, place):
-    """Rays that touch a cylinder, and the depth of its front, give back its diameter."""
+    """Rays tangent to a cylinder, and the depth of its front, yield its diameter."""
     radius, foot = 0.00718, np.array([*place, 0.8])
     axis = np.array([np.sin(lean), -np.cos(lean), 0.0])
     away = foot - (foot @ axis) * axis
@@ -181,7 +181,7 @@ def test_diameters_are_those_of_the_cylinder_that_was_seen(lean, place):
 
 
 def test_tilt_is_read_from_the_slope_of_disparity():
-    """A stalk that leans away by 10 degrees, seen at two heights."""
+    """The stalk leans away by 10 degrees, and is seen at two heights."""
     depth = 0.8
     higher = np.array([0.0, -0.1, depth + 0.1 * np.tan(np.radians(10.0))])
     lines = 0.0, higher[1] / higher[2] * CAMERAS.focal
@@ -194,7 +194,10 @@ def test_tilt_is_read_from_the_slope_of_disparity():
 
 
 def over_ground(height: float | None, pitch: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """A pair over level ground, with a wall at 1 m in front of where it begins; the wall alone if no height is given, m."""
+    """Return a grey pair [480, 640] of ground ``height`` m below the cameras, pitched by ``pitch`` rad, before a wall 1 m away.
+
+    Only the wall is visible if the height is None.
+    """
     rng = np.random.default_rng(2)
     left = cv2.GaussianBlur(rng.uniform(0, 255, (480, 640)).astype(np.float32), (0, 0), 1.0)
     right = np.empty_like(left)
@@ -230,7 +233,7 @@ def test_no_ground_is_invented():
 
 
 def test_a_ground_that_is_mostly_hidden_is_found():
-    """A tenth of all windows show it, a third of those low in the image; the others show leaves and stalks at any distance."""
+    """A tenth of all windows show the ground; the others show leaves and stalks at any distance."""
     true = np.array([0.02, 2.3, 0.05])
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -248,7 +251,10 @@ def test_a_ground_that_is_mostly_hidden_is_found():
 
 @pytest.fixture(scope="module")
 def shifted_pair() -> tuple[np.ndarray, np.ndarray, float]:
-    """A textured stalk 30 pixels wide before black, and the same 57.4 pixels further left and one line lower."""
+    """Return a grey pair [240, 300] float32 of a textured stalk 30 pixels wide, and its disparity.
+
+    In the right image, the stalk is 57.4 pixels further left and one row lower.
+    """
     rng = np.random.default_rng(0)
     texture = cv2.GaussianBlur(rng.uniform(0, 255, (240, 300)).astype(np.float32), (0, 0), 1.2)
     stalk = np.zeros_like(texture)
@@ -309,7 +315,7 @@ def test_images_survive_files(tmp_path, suffix):
 @pytest.mark.parametrize("kind", ["int8", "int16", "int32", "float32", "float64"])
 @pytest.mark.parametrize("shape", [(4, 5), (4, 5, 3)])
 def test_images_of_other_numbers_are_told(tmp_path, kind, shape):
-    """One line that pairs are skipped with, both as text and as ``strerror``, which stands beside the name elsewhere."""
+    """The error is one line, both as text and as ``strerror``, which is printed after the name of the file elsewhere."""
     path = tmp_path / "a.tiff"
     assert cv2.imwrite(str(path), np.ones(shape, kind))
     with pytest.raises(OSError, match=f"a.tiff holds {kind} pixels: save it with 8 or 16 bits") as error:

@@ -1,4 +1,4 @@
-"""Calibrations of stereo cameras as files of OpenCV and ROS hold them, and what is wrong with others."""
+"""Tests of calibrations of stereo cameras in files of OpenCV and ROS, and of errors in others."""
 
 import dataclasses
 import os
@@ -90,7 +90,7 @@ def test_chessboards_in_centimetres_and_squares(tmp_path, length, unit, told):
 
 
 def test_the_last_columns_of_both_cameras_count(tmp_path):
-    """Where both are written from a third one, the baseline is their difference; equal ones are no pair's."""
+    """If both are relative to a third camera, the baseline is their difference; equal ones are refused."""
     for side, place in (("left", 0.05), ("right", 0.15)):
         (tmp_path / f"{side}.yaml").write_text(ros(CAMERAS, place))
     assert read_calibration(tmp_path).baseline == pytest.approx(0.1)
@@ -183,7 +183,7 @@ def test_calibrations_are_for_images_of_one_size(tmp_path):
 
 @pytest.mark.parametrize("kind", ["yaml", "xml", "json"])
 def test_files_are_read_as_opencv_reads_them(tmp_path, kind):
-    """Numbers in every way that it writes them, in tables, lists and matrices."""
+    """Integers, floats, strings, lists and matrices are read as by OpenCV."""
     path = tmp_path / f"any.{kind}"
     store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     matrix = np.random.default_rng(0).normal(size=(3, 4)) * 10.0 ** np.arange(-6, 6).reshape(3, 4)
@@ -203,7 +203,7 @@ def test_files_are_read_as_opencv_reads_them(tmp_path, kind):
 
 
 def test_a_calibration_may_be_a_stream_of_documents(tmp_path):
-    """As `rostopic echo` prints it: the first message counts."""
+    """Of several documents, as printed by `rostopic echo`, the first counts."""
     path = tmp_path / "rig.yaml"
     write_calibration(path, CAMERAS)
     path.write_text(path.read_text() + "---\nP1: 7\n")

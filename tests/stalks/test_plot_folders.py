@@ -1,4 +1,4 @@
-"""Folders of images and odometries as cameras and robots write them: which images are a pair, and what was driven."""
+"""Tests of folders of images and odometry as written by cameras and robots: pairing of images, and distances driven."""
 
 from pathlib import Path
 
@@ -205,7 +205,7 @@ DEGREES = np.degrees(0.2 / 6_371_000.0)
 
 
 def rows(head: str, line: str) -> str:
-    """A table with a row for each image, whose name, stem and number the line may hold, and what it depends on."""
+    """Return a table with a row for each image, formatted by ``line`` from its name, stem, number and position."""
     values = [
         {"name": name, "stem": name[:-4], "upper": name.upper(), "row": row, "x": 0.12 * row, "y": 0.16 * row}
         for row, name in enumerate(NAMES)

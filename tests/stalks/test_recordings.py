@@ -1,4 +1,4 @@
-"""Recordings of ROS 1 and ROS 2 as `phenotype run` takes them: images of both cameras, their calibration, and the way."""
+"""Tests of ROS 1 and ROS 2 recordings in `phenotype run`: images of both cameras, calibrations, and odometry."""
 
 from pathlib import Path
 
@@ -35,7 +35,7 @@ def write(
     distortion: float = 0.0,
     storage: str = "mcap",
 ) -> Path:
-    """A recording of `FRAMES` pairs; the right images come 2 ms after the left ones, and the robot drives 0.5 m a second."""
+    """Write a recording of `FRAMES` pairs; right images come 2 ms after the left ones, and the robot drives at 0.5 m/s."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2

@@ -1,4 +1,4 @@
-"""Sections: targets in bands of the image, their augmentation, chains, and the cut of chains to the band of heights."""
+"""Tests of sections: targets in bands of the image, augmentation, chains, and cutting chains to the band of heights."""
 
 import dataclasses
 
@@ -43,7 +43,7 @@ true_sections, decode_sections, encode = jax.jit(true_sections, static_argnums=3
 def straight(
     column: float, slope: float, wide: float, visible: float | np.ndarray = 1.0, rows: int = HEIGHT // 8
 ) -> np.ndarray:
-    """Edges [R, 3] of a straight stalk that stands in ``column`` in the first row."""
+    """Return edges [R, 3] of a straight stalk whose axis is in ``column`` at the top of the image."""
     middle = column + slope * (np.arange(HEIGHT // 8) + 0.5) * 8
     return np.stack([middle - wide / 2, middle + wide / 2, np.broadcast_to(visible, len(middle))], axis=-1).astype(np.float32)
 
@@ -99,7 +99,7 @@ def test_anchors_have_the_order_of_the_proposals():
 
 
 def test_edges_move_with_the_image():
-    """A bright leaning strip: wherever the image is moved, the edges are those of the strip."""
+    """Edges of bright leaning strips stay at the strips when the image is augmented."""
     edges = np.stack([straight(60, 0.2, 14), straight(120, -0.1, 10)])
     rows, columns = np.arange(HEIGHT) + 0.5, np.arange(WIDTH) + 0.5
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
@@ -167,7 +167,7 @@ def test_features_of_sections_are_those_of_roi_align():
 
 
 def chain_of(*columns: float, wide: float = 12.0, bands: tuple[int, ...] | None = None) -> np.ndarray:
-    """Sections [N, 6] of one stalk whose axis has these columns at the borders of bands."""
+    """Return sections [N, 6] of one stalk whose axis is in ``columns`` at the borders of bands; all bands if None."""
     bands = bands or tuple(range(len(columns) - 1))
     ends = np.array([columns[:-1], columns[1:]]).T[list(bands)]
     tops = 32.0 * np.array(bands)

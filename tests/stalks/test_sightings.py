@@ -1,4 +1,4 @@
-"""From folders of pairs to stalks: which images belong together, which sightings are one stalk, how good finds are."""
+"""Tests from folders of pairs to stalks: pairing of images, tracking of sightings, widths, and scores of detections."""
 
 import dataclasses
 import math
@@ -113,7 +113,7 @@ def sighting(along: float, depth: float = 0.8, **parts) -> Sighting:
 
 
 def drive(stalks: list[tuple[float, float]], steps: int = 20, scale: float = 1.0, seed: int = 0):
-    """Sightings of stalks (place along the row, depth), m, of a robot whose odometry is wrong by a factor."""
+    """Return the sightings of stalks (position along the row, depth), m, and odometry that is wrong by a factor ``scale``."""
     rng = np.random.default_rng(seed)
     places = 0.05 + 0.1 * np.arange(steps)
     frames = []
@@ -166,7 +166,7 @@ def test_odometry_in_another_unit_does_not_fit(scale):
 
 
 def test_images_that_share_nothing_contradict_nothing():
-    """A pair every 1.3 m, of 1.2 m each."""
+    """Pairs are 1.3 m apart, and show 1.2 m each."""
     rng = np.random.default_rng(0)
     frames = [[sighting(x) for x in rng.uniform(-0.6, 0.6, 16)] for _ in range(6)]
     assert track_either_way(frames, 1.3 * np.arange(6), CAMERAS).is_consistent
@@ -210,7 +210,7 @@ def test_a_sighting_without_disparity_still_says_where_its_stalk_is():
 
 
 def test_a_stalk_that_leans_out_of_the_plot_stands_in_it():
-    """Its foot counts: 40 mm inside where it was measured at 12 inches, 13 mm beyond the end."""
+    """Its foot counts: measured 40 mm beyond the end at 12 inches, it stands 14 mm inside if it leans outwards."""
     frames, distances = drive([*STALKS, (2.04, 0.8)])
     assert sum(track.counted for track in track_stalks(frames, distances, CAMERAS)[0]) == len(STALKS)
     for lean, more in ((10.0, 1), (-10.0, 0)):
@@ -220,7 +220,7 @@ def test_a_stalk_that_leans_out_of_the_plot_stands_in_it():
 
 
 def test_a_stalk_whose_depth_went_astray_is_no_other_one():
-    """In some pairs it is taken to stand 6 cm further away; the cameras see it where they would see the first one."""
+    """In some pairs, its depth is 6 cm too large, but it is seen in the same direction."""
     frames, distances = drive([(0.6, 0.8), (1.4, 0.8)])
     for frame in frames[3:7]:
         each, far = frame[0], 0.86
@@ -263,7 +263,7 @@ def test_widths_are_medians_with_an_error():
 
 
 def test_errors_of_widths_hold_what_pairs_share():
-    """Of pairs that agree exactly: masks that err alike, a calibration, and edges that may be hidden."""
+    """If pairs agree exactly, the error is that of the masks' common bias, the calibration, and edges that may be occluded."""
 
     def error(**parts) -> float:
         width = robust_width([sighting(0.0, diameter_mm=14.0, deviation_mm=0.0, **parts) for _ in range(9)])
@@ -277,7 +277,7 @@ def test_errors_of_widths_hold_what_pairs_share():
 
 
 def test_widths_are_those_at_12_and_24_inches():
-    """Stalks that were measured 2 inches below and above; one is hidden at 24 inches, and one shows no ground."""
+    """Stalks are measured 2 inches below and above; one is occluded at 24 inches, one shows no ground, one is not measured."""
     taper, inch = 0.3, 0.0254
 
     def seen(beside: float, **parts) -> Sighting:
@@ -305,7 +305,7 @@ def test_widths_are_those_at_12_and_24_inches():
 
 
 def test_a_stalk_counts_from_where_it_faces_the_camera():
-    """An oval stalk looks thinner from aside."""
+    """Sightings from aside, from where an oval stalk looks thinner, have less weight."""
     stalk = [sighting(0.0, diameter_mm=14.0 - 0.05 * abs(ray), ray_deg=ray) for ray in (-36.0, -24.0, 0.0, 2.0, 24.0, 36.0)]
     alike = [dataclasses.replace(each, ray_deg=None) for each in stalk]
     assert robust_width(stalk).mm > 13.5 > robust_width(alike).mm  # pyright: ignore[reportOptionalMemberAccess]

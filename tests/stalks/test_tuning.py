@@ -1,4 +1,4 @@
-"""Training on a few annotated images: split by photograph, frozen layers, early stopping, and the report."""
+"""Tests of training on a few annotated images: split by photograph, frozen layers, early stopping, and the report."""
 
 import dataclasses
 import itertools
@@ -28,7 +28,7 @@ SETTINGS = dataclasses.replace(TINY, pixels_per_metre=0.0)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Seven photographs with a bright stalk each, one of them twice, with outlines."""
+    """Folder of seven photographs of one bright stalk each, one of them twice, with outlines."""
     folder = tmp_path_factory.mktemp("labelled")
     rng = np.random.default_rng(0)
     images, annotations, images_drawn = [], [], []
@@ -60,7 +60,7 @@ def params() -> dict:
 
 @pytest.fixture(scope="module")
 def tuned(folder, params):
-    """A training that cannot become better, as its rate is 0."""
+    """Split, progress lines and result of a training that cannot improve, as its learning rate is 0."""
     settings = dataclasses.replace(fit_settings(folder, SETTINGS), anchor_widths=TINY.anchor_widths)
     examples = list(annotated_examples(folder, settings))
     names = [f"{number}.png" for number in range(8)]
@@ -158,7 +158,7 @@ def test_frozen_layers_do_not_decay(folder, params):
 
 
 def differences(before: dict, after: dict) -> dict[str, float]:
-    """The greatest change of any number of each array."""
+    """Return the maximum absolute change of each array, by its path."""
     changes = jax.tree.map(lambda a, b: float(np.abs(a - b).max()), before, after)
     named = jax.tree_util.tree_flatten_with_path(changes)[0]
     return {"/".join(str(step.key) for step in path): change for path, change in named}

@@ -44,9 +44,9 @@ class Eval(EvaluationOptions):
     policy: Path | None = None
     """Run folder of the policy, for --loops policy."""
     trust: bool = False
-    """Run the code of the policy's run without asking, if its task is module:Name and was trained by somebody else."""
+    """With --policy: run the code of its run without asking, if its task is module:Name and was trained by somebody else."""
     policy_seed: int | None = None
-    """Seed of the policy within its run; the first if not given."""
+    """With --policy: seed of the policy within its run; the first if not given."""
 
 
 def check_wind(wind: float) -> None:

@@ -68,7 +68,7 @@ class PlantOptions:
     shift: tuple[str, ...] = ()
     """Factors of the family to shift alone: flash, lean, rig, noise, leaves, textures."""
     spec: Path | None = None
-    """JSON or TOML file with the values of a custom family."""
+    """JSON or TOML file with the values of a custom family, instead of --family and --shift."""
     frames: int | None = None
     """Number of pairs per plot or run; that of the family if not given: 34 for `phenotype`, 5 for `grasp`."""
     width: int | None = None
@@ -133,18 +133,20 @@ class TrainingOptions(PlantOptions):
     out: Annotated[Path, AlsoPositional()]
     """File of the weights, .safetensors, for --weights of `run` and `eval`."""
     minutes: float | None = None
-    """Maximum duration in minutes; the weights are written at the end and every half minute before."""
+    """Maximum duration in minutes, including compilation; the weights are written at the end and every half minute before.
+    With `phenotype train --data`, compilation and reading do not count, and the best weights so far are written."""
     steps: int | None = None
     """Maximum number of updates; if not given, 20,000, or 1,500 for `phenotype train --data`."""
     images: int = 800
-    """Number of synthetic training images."""
+    """Maximum number of synthetic training images; ignored with `phenotype train --data`."""
     batch: int = 16
     """Batch size in images or crops."""
     rate: float | None = None
     """Peak learning rate. If not given, 0.001, but 0.0004 for `grasp train --loss gan`, and 0.0003 if `phenotype train` starts
     from weights."""
     workers: int = 4
-    """Number of processes that render synthetic images during training; with 1, a thread of the main process does."""
+    """Number of processes that render synthetic images during training; with 1, a thread of the main process does. Ignored with
+    `phenotype train --data`."""
 
     def check(self) -> None:
         """Check the values of the options.
@@ -178,7 +180,8 @@ class DetectorTraining(TrainingOptions):
     batch: int = 8
     """Batch size in images."""
     crops: int = 32
-    """Number of full-resolution stalk crops per update, for the masks."""
+    """Number of full-resolution stalk crops per update, for the masks; ignored with --data if no annotation has an outline,
+    unless training starts from random weights."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -186,7 +189,7 @@ class EvaluationOptions(PlantOptions):
     """Options of a command that scores results against the ground truth of synthetic plots or runs."""
 
     weights: Path | None = None
-    """Weights from `train`; the shipped ones if not given."""
+    """Weights from `train`; the shipped ones if not given. Not with --masks truth."""
     workers: int = 1
     """Number of processes that evaluate plots or runs in parallel; they share the GPUs and cores, and take about 2 GB of memory
     each. It affects times, but no scores."""
@@ -213,8 +216,8 @@ class CameraOptions:
     of ROS. If not given, the one in each folder: calibration.yaml, extrinsics.yml, calib.txt, or left.yaml and right.yaml.
     Without a calibration there are no metric lengths."""
     calibration_unit: str | None = None
-    """Unit of the calibration's baseline, if the file does not state it: m, cm or mm, or the side of a chessboard square, such
-    as 24mm, if lengths are in squares."""
+    """Unit of the calibration's baseline: m, cm or mm, or the side of a chessboard square, such as 24mm, if lengths are in
+    squares. If not given, the unit that the file states or its program uses, or else m."""
     speed: float | None = None
     """Speed of the robot in m/s, for an odometry.csv that holds only times."""
 

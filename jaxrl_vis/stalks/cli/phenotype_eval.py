@@ -28,7 +28,7 @@ class Eval(EvaluationOptions):
     method: Literal["strip", "ellipse"] = "strip"
     """Method of measuring widths: between two edges (strip), or by ellipses as in the thesis."""
     min_score: float = 0.5
-    """Minimum score of a detection that counts as a stalk, 0 to 1."""
+    """Minimum score of a detection that counts as a stalk, 0 to 1; without effect with --masks truth."""
     thesis: bool = False
     """Also score the thesis's methods (ellipses, semi-global matching, stalks per metre of image) on the same detections."""
     each_factor: bool = False

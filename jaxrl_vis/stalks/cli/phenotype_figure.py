@@ -27,9 +27,9 @@ class Figure:
     """File written by `phenotype eval --json`; if not given, plots are evaluated first, and the file is written beside the
     figure."""
     plots: int | None = None
-    """Number of plots to evaluate; 10 if not given."""
+    """Number of plots to evaluate; if not given, 10, or 3 with --quick. Not with --evaluation."""
     quick: bool = False
-    """Evaluate small plots, three of them unless --plots is given; suitable for a CPU."""
+    """Evaluate small plots, three of them unless --plots is given; suitable for a CPU. Not with --evaluation."""
 
 
 def draw(options: Figure) -> int:

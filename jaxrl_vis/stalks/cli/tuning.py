@@ -26,7 +26,7 @@ _RATE, _RATE_FROM_RANDOM = 3e-4, 1e-3
 def train_on_images(options: DetectorTraining, folder: Path) -> int:
     """Train on a folder of annotated images, and return the exit status.
 
-    Writes the weights and, beside them, an HTML report on held-out images, if there are enough images to hold some out.
+    Write the weights and, beside them, an HTML report on held-out images, if there are enough images to hold some out.
 
     Raises:
         RequestError: The annotations or images are unusable, the initial weights do not fit them, or a file cannot be written.
@@ -158,7 +158,8 @@ def _report(
 def _start(options: DetectorTraining, folder: Path, echo: Any) -> tuple[Any, Settings, str]:
     """Return the initial parameters (None for random ones), settings of the networks, and a phrase for the origin.
 
-    Without a calibration, networks detect sections: nothing in an image shows where the band is.
+    Without a calibration, networks detect sections: nothing in an image shows where the band is. With one, parameters are
+    random if the shipped weights are for stalks of a very different size.
 
     Raises:
         RequestError: Weights given by ``--start`` are for stalks of a very different size.

@@ -146,7 +146,7 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
 
 
 def _sources(folder: PlotFolder) -> dict[str, Any]:
-    """Return the state of the files that the record of a run depends on: its odometry and the images of each pair."""
+    """Return the state of the files that the record of a run depends on: its odometry.csv and the files of each pair."""
     return {
         "odometry": file_state(folder.folder / "odometry.csv"),
         "pairs": {pair.name: pair_state(pair) for pair in folder.pairs},

@@ -55,8 +55,8 @@ from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, float | None, Band | None, PlotFolder, PairFiles], list[Detection]]
-"""Stalk detector, called with a left image [H, W, 3] uint8, its pixels per metre at the row and the rows of the band (None if
-unknown), and its folder and files; returns the detections in pixels of the image."""
+"""Stalk detector, called with a left image [H, W, 3] uint8, its pixels per metre at the row of plants and the image rows of the
+band (None if unknown), and its folder and files; returns the detections in pixels of the image."""
 NO_ODOMETRY = "no odometry"
 NO_FIT = "odometry does not fit the images"
 SKIPPED_COLUMNS = ("plot", "pair", "why")
@@ -72,7 +72,7 @@ class Request:
         finder: Name of the detector; results of different detectors are not mixed in one folder.
         calibrations: Calibration of each plot by its name; None if it has none.
         speed: Speed of the robot, m/s, for odometry with times only; None if unknown.
-        disparity_scale: Divisor of disparities in 16-bit images.
+        disparity_scale: Divisor of disparities in integer images, such as PNG of 16 bits.
         lens_range: Range of lenses on which the detector was validated; None to accept any.
         max_doubt: Doubt of the gate above which an image is reported as unfamiliar; None if there is no gate.
     """

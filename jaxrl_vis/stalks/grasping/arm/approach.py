@@ -45,7 +45,7 @@ def clearance(target: np.ndarray, others: np.ndarray, radii: np.ndarray, whole_p
         target: [B, 3], m in the frame of the stand.
         others: [B, M, 2], centres of other stalks at the target's height, m in the frame of the stand; NaN for absent ones.
         radii: [B, M], radii of these stalks, m.
-        whole_path: Whether to include the forearm and the whole path, on which the folded arm turns and then extends; if not,
+        whole_path: If true, include the forearm and the whole path, on which the folded arm turns and then extends; if not,
             only the open gripper at the target. Stalks are assumed vertical, although the arm turns at other heights.
 
     Returns:

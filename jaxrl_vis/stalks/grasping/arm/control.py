@@ -43,7 +43,18 @@ class Timing:
 
 
 class Gains(NamedTuple):
-    """Gains and limits of the controllers; [2] for shoulder and elbow. SI units."""
+    """Gains and limits of the controllers, in SI units; see `step_controllers`.
+
+    Attributes:
+        proportional, integral, derivative: Gains of the PID controllers, [2] for shoulder and elbow.
+        spring: Stiffness of the elastic part of a joint, [2].
+        torque: Maximum torque, [2].
+        motor: Inverse time constant of the motors.
+        slide_proportional, slide_integral: Gains from the slide's position error to its speed.
+        slide_speed: Maximum speed of the slide.
+        slide_drive: Force on the slide per error of its speed.
+        jaw_force: Force that closes, or opens, each jaw.
+    """
 
     proportional: Any = (260.0, 130.0)  # N m/rad
     integral: Any = (600.0, 300.0)  # N m/(rad s)

@@ -43,7 +43,12 @@ def check_policy(policy: Policy) -> None:
 
 
 class _LoopState(NamedTuple):
-    """State of an arm during a reach, and setpoint [3] of its grip, m in the frame of the stand."""
+    """State of one arm moved by a policy.
+
+    Attributes:
+        reaching: State of the reach.
+        setpoint: [3] float32, setpoint of the grip, m in the frame of the stand.
+    """
 
     reaching: Reaching
     setpoint: jax.Array

@@ -49,7 +49,7 @@ class ReachResult:
         taken: [B, T, 3] float32, actual positions of the grip, m in the plot's frame.
         arm_contact: [B, N] bool, stalks that upper arm or forearm touched at any time.
         gripper_contact: [B, N] bool, stalks that the open jaws or the palm touched before the jaws began to close.
-        reachable: [B] bool, whether the target is within the arm's reach.
+        reachable: [B] bool, True if the target is within the arm's reach.
         error: [B] float32, distance of the grip from the target when the jaws began to close, m; NaN if out of reach.
         poses: [B, T, J] float32, positions of all joints of the model, for rendering (`video`).
         interval: Time between two points of a path, s.
@@ -99,7 +99,13 @@ class Reaching(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """Constants of one arm's reach: shapes of its stalks, wind, and solution of the inverse kinematics (1 or -1)."""
+    """Constants of one arm's reach.
+
+    Attributes:
+        shape: Shapes of its stalks.
+        gusts: Wind.
+        side: [] float32, solution of the inverse kinematics, 1 or -1.
+    """
 
     shape: Shape
     gusts: Gusts
@@ -332,7 +338,7 @@ def step_control(
         scene: Constants of the reach.
         reaching: State of the arm.
         target: [3], setpoint of the grip, m in the frame of the stand.
-        is_closing: [] bool, whether the jaws close.
+        is_closing: [] bool, True to close the jaws, False to open them.
         gains: Gains of the controllers.
 
     Returns:

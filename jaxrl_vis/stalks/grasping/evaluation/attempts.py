@@ -60,7 +60,7 @@ class Plan:
         stalks: [B] int, index of the stalk that each target is matched with; -1 for none.
         errors: [B] float64, horizontal distance of the target from that stalk, m; NaN for none.
         sides: [B] float64, 1 or -1: solution of the inverse kinematics.
-        refused: [B] bool, whether the arm is not sent because other stalks are in its path.
+        refused: [B] bool, True if the arm is not sent because other stalks are in its path.
         redetection_errors: [B, 2] float64, error of the stalk's position as detected by the pair at the stop alone, along and
             across the row, m; NaN where the pair does not show the stalk.
         stands: True stalks around the arm at the stop of each attempt.

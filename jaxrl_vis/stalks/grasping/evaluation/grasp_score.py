@@ -29,10 +29,10 @@ class Attempt:
         run: Number of the run.
         stalk: Index of the stalk that the grasp point is matched with (`match_grasps`); None if there is none.
         held: Indices of the stalks between the closed jaws.
-        reachable: Whether the grasp point is within the arm's reach; if not, nothing is held.
-        refused: Whether the arm was not sent because detected stalks were in its path; if so, nothing is held.
-        collided: Whether upper arm or forearm touched a stalk other than the target.
-        brushed: Whether the gripper touched such a stalk before the jaws began to close.
+        reachable: True if the grasp point is within the arm's reach; if not, nothing is held.
+        refused: True if the arm was not sent because detected stalks were in its path; if so, nothing is held.
+        collided: True if upper arm or forearm touched a stalk other than the target.
+        brushed: True if the gripper touched such a stalk before the jaws began to close.
         aim_error: Horizontal distance of the grasp point from the centre of the stalk, m; NaN without one.
     """
 
@@ -71,7 +71,7 @@ class Standing:
     Attributes:
         run: Number of the run.
         stalk: Index of the stalk.
-        reachable: Whether the stalk is within the arm's reach from any stop of the run.
+        reachable: True if the stalk is within the arm's reach from any stop of the run.
         room: Clearance between the open gripper and other stalks on the best path, m; -inf if unreachable; see
             `approach.clearance`.
         neighbour: Distance to the nearest other stalk at the height of the grasp, centre to centre, m; inf if there is none.

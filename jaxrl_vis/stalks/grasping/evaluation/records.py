@@ -155,9 +155,9 @@ class Reaches:
     Attributes:
         loop: Control loop of the arm: open, with repeated detection, or a policy.
         wind_mm: Amplitude of the stalks' sway, mm.
-        for_policy: Whether attempts are planned as in the policy's task, for any loop; see `attempts.plan`.
+        for_policy: True if attempts are planned as in the policy's task, for any loop; see `attempts.plan`.
         policy: Policy of the loop ``policy``; None for the others.
-        policy_name: Name of the policy.
+        policy_name: Name of the policy in the records; empty without one.
     """
 
     loop: Loop

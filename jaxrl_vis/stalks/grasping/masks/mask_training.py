@@ -164,13 +164,13 @@ def train(
         settings: Settings of the generator, including its loss.
         plan: Schedule of the training.
         report: Callback for reports, see `Report`.
-        report_interval: Interval of reports, s.
+        report_interval: Minimum interval between reports, s.
 
     Returns:
         The averaged parameters of the generator, and the number of updates.
 
     Raises:
-        NonFiniteError: A loss is no longer finite.
+        NonFiniteError: A loss is not finite when it is to be reported.
         RequestError: The time limit was reached before the first update.
     """
     started = time.monotonic()

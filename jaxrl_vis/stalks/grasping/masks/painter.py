@@ -29,7 +29,7 @@ class Settings:
 
     Attributes:
         loss: Loss of the training; with ``gan`` the generator paints images, with ``segmentation`` it returns logits.
-        channels: Channels of each level.
+        channels: Channels of each level, multiples of 8.
     """
 
     loss: Loss = "segmentation"
@@ -37,7 +37,7 @@ class Settings:
 
     @property
     def multiple(self) -> int:
-        """Divisor that the network requires of height and width of an image, pixels."""
+        """Number of pixels by which the height and width of the network's input must be divisible."""
         return 2 ** len(self.channels)
 
     def generator(self, dtype: Any) -> Generator:

@@ -25,7 +25,8 @@ class GraspPoint:
     """Grasp point on a detected stalk, with the line of the stalk.
 
     Attributes:
-        point: [3] float64, centre of the stalk at the grasp, in the robot frame of the last pair, m.
+        point: [3] float64, centre of the stalk at the grasp, in the robot frame of the last pair, m; if detected by slice, the
+            mean of the points on its front.
         direction: [3] float64, unit vector along the stalk at the grasp, upwards.
         thickness: Diameter at the grasp, m; NaN if not measured.
         frames: Number of pairs that show the stalk; 0 if unknown.
@@ -73,7 +74,13 @@ _APART_BESIDE = 0.008  # m: minimum median distance of such chords
 
 
 class _Line(NamedTuple):
-    """Grasp point of a line, indices of its chords, and number of places at which pairs show it."""
+    """Line that is accepted as a stalk.
+
+    Attributes:
+        point: Grasp point.
+        members: [K] int, indices of its chords.
+        shown: Number of places along the line at which pairs show it, summed over pairs.
+    """
 
     point: GraspPoint
     members: np.ndarray
@@ -124,7 +131,7 @@ def _fit(points: np.ndarray, weights: np.ndarray, bent: bool) -> tuple[np.ndarra
     Args:
         points: [N, 3], m.
         weights: [N].
-        bent: Whether to fit a quadratic instead of a line.
+        bent: If true, fit a quadratic (K = 3) instead of a line (K = 2).
 
     Returns:
         Coefficients [K, 2], constant term first, and the weighted mean height, m.

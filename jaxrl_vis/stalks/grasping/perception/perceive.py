@@ -1,6 +1,6 @@
 """Perception of a run, from stereo pairs to grasp points: stereo matching, masks, stitching, and detection.
 
-pair -> disparity -> organised cloud, red where the mask is True
+pair -> disparity -> organised cloud, with the mask of the stalks
      -> stitched to the robot frame of the last pair, where the robot begins to grasp
      -> grasp points: a line per stalk, or the thesis's slices
 """
@@ -74,8 +74,8 @@ class Variant:
     """Choice of the steps that follow the thesis instead of the default.
 
     Attributes:
-        stitch: Whether clouds are stitched as in the thesis.
-        points: Whether grasp points are detected as in the thesis.
+        stitch: If true, clouds are stitched as in the thesis.
+        points: If true, grasp points are detected as in the thesis.
     """
 
     stitch: bool = False

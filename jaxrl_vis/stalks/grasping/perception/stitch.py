@@ -60,7 +60,7 @@ class Method:
         gates: Maximum distances of corresponding points, m, applied in this order.
         steps: Maximum number of iterations with each gate.
         max_points: Approximate number of points of the source cloud with each gate, evenly subsampled.
-        from_odometry: Whether to start from the odometry and refuse results that differ too much from it, and to weight
+        from_odometry: If true, start from the odometry, refuse results that differ too much from it, and weight
             correspondences robustly; if not, start from the identity.
         pixels: Approximate number of pixels of an image to use, evenly subsampled.
     """

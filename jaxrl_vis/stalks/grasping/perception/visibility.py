@@ -29,7 +29,7 @@ class Visibility:
     mount: Mount
 
     def query(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where pairs show a stalk at points, and where they see through them.
+        """Return masks of the points at which pairs show a stalk, and of those that they see through.
 
         Both are False for points that are outside the image, occluded, or at pixels without depth.
 

@@ -33,6 +33,8 @@ def draw_reach(
 ) -> None:
     """Draw figure 4.5 of the middle one of a run's attempts that are sent; with ``video``, also render all of these.
 
+    The arm detects the stalks again on the way, see `attempts.redetecting_observer`.
+
     Args:
         out: Path of the figure.
         family: Family that the row is sampled from.

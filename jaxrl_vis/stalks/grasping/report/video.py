@@ -32,7 +32,7 @@ def write_reaches(
         path: A .gif, .mp4 or .html file.
         stands: Stands of all reaches.
         result: Results of all reaches.
-        targets: [B], index of the stalk that each reach is for.
+        targets: [B], index of the stalk that each reach is for; -1 for none.
         chosen: Indices of the reaches to show.
         size: Height and width of the rendered image, without its header, px.
 

@@ -3,8 +3,9 @@
 Sections of adjacent bands are linked where the axis of one continues that of the other and their widths are similar, best pairs
 first and one to one; then, over gaps of one to three bands that leaves hide, those that are still free.
 
-The score of a chain is 1 - sqrt(prod(1 - s)) over the scores s of its sections: several weak sections are evidence (five of 0.5
-give 0.82), and a single one is less than it says (one of 0.9 gives 0.68). The root allows for neighbours that err together.
+The score of a chain is 1 - sqrt(prod(1 - s)) over the scores s of its sections: several weak sections add up (five of 0.5 give
+0.82), and a single one counts for less than its own score (one of 0.9 gives 0.68). The root allows for neighbours whose errors
+are correlated.
 """
 
 import dataclasses
@@ -47,7 +48,7 @@ def link(sections: np.ndarray, scores: np.ndarray, section: int) -> list[Chain]:
 
     Args:
         sections: Boxes and axes [N, 6], whose tops are multiples of ``section``.
-        scores: Scores [N]; sections with low scores are ignored.
+        scores: Scores [N]; sections below 0.1 are ignored.
         section: Height of a band, pixels.
     """
     used = scores >= _MIN_SCORE
@@ -78,7 +79,10 @@ def _widths(sections: np.ndarray) -> np.ndarray:
 
 
 def _distances(upper: np.ndarray, lower: np.ndarray, upper_wide: np.ndarray, lower_wide: np.ndarray, gap: float) -> np.ndarray:
-    """Return how badly the axes of pairs of sections [K, 6] continue each other, 0 for well; infinite if they cannot."""
+    """Compute the cost [K] of linking pairs of sections [K, 6] with ``gap`` pixels in between; infinite if impossible.
+
+    The cost is the distance of their extrapolated axes in mean widths, plus half the log ratio of the widths.
+    """
     tall = upper[:, 3] - upper[:, 1]
     slopes = [(part[:, 5] - part[:, 4]) / tall for part in (upper, lower)]
     # Both axes are extrapolated to the middle between the sections.

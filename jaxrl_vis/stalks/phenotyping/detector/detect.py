@@ -35,8 +35,8 @@ class Settings:
     """Settings of the networks, stored with their weights.
 
     Attributes:
-        pixels_per_metre: Resolution at the row to which images are resized before detection; 0 for networks trained on images
-            of unknown cameras, which are resized to `width`.
+        pixels_per_metre: Resolution, at the row of plants, to which images are resized before detection; 0 for networks trained
+            on images of unknown cameras, which are resized to `width`.
         width, lines: Width and height of a resized image of the training cameras, pixels. Images of unknown cameras are
             downscaled to the width; narrower ones are not enlarged unless `pixels_per_metre` is 0.
         full_width: Image width in pixels at which stalk crops measure `crop_height` x `crop_width`; at fewer pixels per metre
@@ -80,12 +80,12 @@ class Settings:
     def scale_for(self, width: int, pixels_per_metre: float | None) -> float:
         """Return the factor by which an image is resized before detection.
 
-        Cameras whose resolution is close to that of the training cameras have exactly their factor.
+        Cameras whose resolution is within 6 % of that of the training cameras get exactly the factor of these.
 
         Args:
             width: Width of the image, pixels.
-            pixels_per_metre: Resolution at the row; None if the camera is unknown, which is then assumed to cover the same
-                width of the row as the training cameras.
+            pixels_per_metre: Resolution of the image at the row of plants; None if the camera is unknown, which is then assumed
+                to show as wide a stretch of the row as the training cameras. Ignored if that of the settings is 0.
         """
         if not pixels_per_metre or not self.pixels_per_metre:
             return self.width / width
@@ -93,7 +93,7 @@ class Settings:
         return usual if abs(factor / usual - 1.0) <= _SAME_CAMERA else factor
 
     def for_sections(self) -> "Settings":
-        """Return these settings for networks that detect sections, of which an image has more than stalks."""
+        """Return these settings for networks that detect sections: with default anchors, and more detections per image."""
         usual = Settings()
         return dataclasses.replace(
             self,
@@ -182,7 +182,7 @@ def select_proposals(
         shape: Height and width of the image, to which proposals are clipped.
 
     Returns:
-        Proposals [P, 6], their logits [P] float32 (-inf for padding) and whether each is valid [P] bool, where P is
+        Proposals [P, 6], their logits [P] float32 (-inf for padding), and their validity [P] bool, False for padding. P is
         ``settings.proposals``, or less if there are fewer candidates.
     """
     count = min(settings.candidates, logits.shape[0])
@@ -208,7 +208,7 @@ def section_proposals(
         settings: Number of proposals and the suppression threshold.
 
     Returns:
-        Proposals [P, 6], their bands [P] int32, and whether each is valid [P] bool.
+        Proposals [P, 6], their bands [P] int32, and their validity [P] bool, False for padding; P as for `select_proposals`.
     """
     bands, each = anchors.shape[:2]
     count = min(max(settings.candidates // bands, 1), each)

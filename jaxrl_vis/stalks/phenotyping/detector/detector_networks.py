@@ -13,7 +13,7 @@ STRIDE = (8, 4)
 ANCHOR_STRIDE = (16, 4)
 """Vertical and horizontal stride of the anchors, pixels."""
 PADDING = 32
-"""Divisor of the height and width that an image must have, pixels: the largest stride of the backbone."""
+"""Number of pixels by which the height and width of an image must be divisible: the largest stride of the backbone."""
 
 
 class Block(nn.Module):
@@ -47,10 +47,10 @@ class Detector(nn.Module):
     """Two-stage detector: backbone, region proposals, and the box head that classifies and refines them.
 
     Attributes:
-        channels: Channels from the finest to the coarsest level; multiples of 8.
+        channels: Channels from the finest to the coarsest level; multiples of 8. Features have those of the third.
         hidden: Units of the box head.
         anchors: Number of anchors at each location.
-        rows: Number of rows of `ANCHOR_STRIDE` that are averaged before the proposals, one per band of sections.
+        rows: Number of vertically adjacent anchor locations that are averaged to one: with sections, those of a band; else 1.
         dtype: Compute dtype of the convolutions.
     """
 
@@ -93,7 +93,10 @@ class Detector(nn.Module):
         return self.merge(middle + _upsample(up))
 
     def propose(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return objectness logits [N, K] and box offsets [N, K, 6] of all anchors, in row-major order."""
+        """Return objectness logits [N, K] and box offsets [N, K, 6], float32, of all anchors, in row-major order.
+
+        ``features`` [N, h, w, C] are those of `features`.
+        """
         x = nn.relu(self.tall(features))
         count = x.shape[0]
         if self.rows > 1:
@@ -101,7 +104,7 @@ class Detector(nn.Module):
         return self.objectness(x).reshape(count, -1), self.offsets(x).reshape(count, -1, 6)
 
     def classify(self, regions: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return logits [R] and box offsets [R, 6] of pooled regions [R, h, w, C]."""
+        """Return logits [R] and box offsets [R, 6], float32, of pooled regions [R, h, w, C]."""
         x = regions.astype(self.dtype)
         for look in self.looks:
             x = nn.relu(look(x))

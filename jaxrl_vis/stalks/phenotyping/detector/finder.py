@@ -44,7 +44,7 @@ class Detection:
         mask: Mask [h, w] of its visible pixels in a part of the image, float32 from 0 to 1, or bool.
         corner: Image row and column of the first pixel of the mask.
         upper: Mask and corner of its segment around 24 inches above the ground; None if that is not in the image.
-        strip: Straight edges fitted to the mask; None if not fitted.
+        strip: Straight edges fitted to the mask, in pixels of the mask; None if not fitted.
     """
 
     box: tuple[float, float, float, float]
@@ -86,7 +86,7 @@ def upper_segment(stalk: np.ndarray) -> np.ndarray:
 
 
 def resize_factor(width: int, settings: Settings, pixels_per_metre: float | None) -> float:
-    """Return the factor by which `resize` resizes an image ``width`` pixels wide.
+    """Return the factor by which `resize` resizes an image ``width`` pixels wide, 3 at most.
 
     An image is enlarged only if its ``pixels_per_metre`` is known or the networks were trained on images of unknown cameras.
     """
@@ -101,7 +101,7 @@ def resize(image: np.ndarray, settings: Settings, pixels_per_metre: float | None
     Args:
         image: [H, W, 3] uint8.
         settings: Settings of the networks.
-        pixels_per_metre: Resolution of the image at the row; None if unknown.
+        pixels_per_metre: Resolution of the image at the row of plants; None if unknown.
 
     Returns:
         Resized image (``image`` itself if its size does not change), and the vertical and horizontal scale factors from its
@@ -183,7 +183,7 @@ class Finder:
 
         Args:
             image: [H, W, 3] uint8.
-            pixels_per_metre: Resolution of the image at the row; None if the camera is unknown.
+            pixels_per_metre: Resolution of the image at the row of plants; None if the camera is unknown.
             band: Rows of the band; None if the camera is unknown. Without it, networks that detect sections return the part of
                 each stalk with the highest scores.
         """
@@ -199,12 +199,12 @@ class Finder:
 
         Args:
             image: [h, w, 3] uint8, without black borders.
-            pixels_per_metre: Resolution of the image at the row; None if the camera is unknown.
-            band: Rows of the band in this image; None if the camera is unknown.
+            pixels_per_metre: Resolution of the image at the row of plants; None if the camera is unknown.
+            band: Rows of the band in this image; None if the camera is unknown. Only used with sections.
 
         Returns:
-            Boxes and axes [N, 6] of all detections down to `Settings.min_score`, in continuous image coordinates, their
-            scores [N], and the pooled features [2 C] of the backbone.
+            Boxes and axes [N, 6] of all detections down to `Settings.min_score` (with sections, of all chains in the band, see
+            `cut_to_band`), in continuous image coordinates, their scores [N], and the pooled features [2 C] of the backbone.
         """
         settings = self._settings
         reduced, scale = resize(image, settings, pixels_per_metre)
@@ -278,12 +278,12 @@ class Finder:
 def cut_to_band(chains: list[Chain], scale: tuple[float, float], band: Band | None) -> tuple[np.ndarray, np.ndarray]:
     """Return boxes and axes [N, 6] in the original image, and scores [N], of the parts of chains in the band.
 
-    Without a band, the part of each chain with the highest scores; see `best_rows`.
+    Chains whose sections cover less than 0.3 of the band are left out.
 
     Args:
         chains: Chains in the resized image.
         scale: Vertical and horizontal factors from coordinates of the resized image to those of the original.
-        band: Rows of the band in the original image.
+        band: Rows of the band in the original image; None for the part of each chain with the highest scores, see `best_rows`.
     """
     stalks, scores = [], []
     for chain in chains:

@@ -72,7 +72,7 @@ def find_stalks(
         weights: Weights file, which must not change during the lifetime of the process.
         min_score: Minimum score of a detection, 0 to 1.
         image: Left image [H, W, 3] uint8.
-        pixels_per_metre: Resolution of the image at the row; None if the camera is unknown.
+        pixels_per_metre: Resolution of the image at the row of plants; None if the camera is unknown.
         band: Rows of the band; None if the camera is unknown.
         plot, pair: Folder and files of the image; unused.
 

@@ -93,13 +93,19 @@ def detector_loss(
 
 
 def focal_loss(logits: jax.Array, shows: jax.Array, none: jax.Array) -> jax.Array:
-    """Sum the focal loss of logits [K] over the positive and negative anchors, each [K] bool."""
+    """Sum the focal loss (alpha 0.5, gamma 2) of logits [K] over positive (``shows``) and negative (``none``) anchors.
+
+    Both are [K] bool; anchors that are neither are ignored. Source: Lin et al. (2017), arXiv 1708.02002.
+    """
     loss = optax.sigmoid_focal_loss(logits, shows.astype(jnp.float32), alpha=0.5, gamma=2.0)
     return (loss * (shows | none)).sum()
 
 
 def offset_loss(offsets: jax.Array, targets: jax.Array, shows: jax.Array) -> jax.Array:
-    """Compute the Huber loss of box offsets [K, 6], summed over the six and averaged over the positive boxes [K] bool."""
+    """Compute the Huber loss of box offsets [K, 6], summed over the six and averaged over the positive boxes.
+
+    ``targets`` [K, 6] are clipped to -20 to 20; ``shows`` [K] bool is True for positive boxes. The loss is 0 without these.
+    """
     loss = optax.huber_loss(offsets, jnp.clip(targets, -20.0, 20.0), delta=1.0).sum(axis=-1)
     return (loss * shows).sum() / jnp.maximum(shows.sum(), 1)
 

@@ -5,7 +5,7 @@ one section in it, a box and an axis [6] whose top and bottom are exactly those 
 1609.03605, turned by 90 degrees). `chains` links sections to stalks.
 
 Edges are the targets before the division into bands, as bands do not move with an image that is augmented or cropped: for each
-`STEP` rows of the image the left and right edge of a stalk, and its visible fraction, `ABSENT` where there is no stalk.
+`STEP` rows of the image the left and right edge of a stalk, pixels, and its visible fraction, `ABSENT` where there is no stalk.
 """
 
 import jax
@@ -24,7 +24,7 @@ ABSENT = -1.0
 UNKNOWN = 0.3
 """Visible fraction of rows of which annotations say nothing, between `_HIDDEN` and `_SHOWN`."""
 WHOLE = 0.7
-"""Minimum fraction of the width of a clear section inside the image."""
+"""Minimum fraction of its width that a clear section has inside the image."""
 _SHOWN = 0.5  # minimum visible fraction of a section to be a target
 _HIDDEN = 0.15  # visible fraction below which a band counts as background
 _NARROW = 4.0  # pixels: narrower stalks are unclear
@@ -60,8 +60,8 @@ def true_sections(edges: jax.Array, kinds: jax.Array, size: jax.Array, section: 
         section: Height of a band, pixels.
 
     Returns:
-        Sections [B, T, 6] float32, and their kinds [B, T] int32. Sections are ``UNCLEAR`` if they are partly hidden, partly
-        outside the image, or narrow, and if their stalk is.
+        Sections [B, T, 6] float32, and their kinds [B, T] int32: ``NOTHING`` where the stalk is absent, hidden or outside the
+        image, ``UNCLEAR`` if the section is partly hidden, partly outside the image, or narrow, or if its stalk is ``UNCLEAR``.
     """
     rows = section // STEP
     bands = edges.shape[1] // rows

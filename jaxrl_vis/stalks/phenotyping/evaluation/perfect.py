@@ -11,11 +11,11 @@ from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, upper_segmen
 def perfect_detections(stalks: Iterable[Mapping[str, Any]], instance: np.ndarray, min_visible: float = 0.3) -> list[Detection]:
     """Return the detections of the visible stalks of an image, from left to right, with score 1.
 
-    Stalks with fewer than 50 visible pixels in the band, or in fewer than five rows, are left out.
+    Stalks with fewer than 50 visible pixels in the band, or whose pixels span fewer than five rows, are left out.
 
     Args:
         stalks: Stalks with ``stalk``, ``band_box`` and ``band_visible``, as in `truth.StalkInView` or plot.json.
-        instance: Index of the stalk that each pixel shows, [H, W] int.
+        instance: Index of the stalk that each pixel shows, negative if none, [H, W] int.
         min_visible: Minimum visible fraction of a stalk's part in the band.
     """
     detections = []

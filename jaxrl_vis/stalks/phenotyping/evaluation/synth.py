@@ -101,7 +101,11 @@ def plot_name(seed: int) -> str:
 
 
 def write_plot(folder: Path, plot: Plot, image_format: ImageFormat, truth: Truth, done: Callable[[int, int], None]) -> None:
-    """Write one plot to its own folder; see `write_plots`."""
+    """Write one plot to its own folder, created if missing; files of the same names are replaced. See `write_plots`.
+
+    Raises:
+        OSError: A file cannot be written.
+    """
     (folder / "truth").mkdir(parents=True, exist_ok=True)
     sequence = Sequence.of(plot)
     write_calibration(folder / "calibration.yaml", sequence.drive.stated)

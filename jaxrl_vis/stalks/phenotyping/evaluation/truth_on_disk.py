@@ -22,7 +22,7 @@ def find_truth(
 
     Args:
         image: The image, of which only the size is used.
-        pixels_per_metre: Ignored.
+        pixels_per_metre, band: Ignored.
         plot: The plot.
         pair: The pair.
 

@@ -49,10 +49,10 @@ def read_annotations(folder: Path, labels: Sequence[str] = ()) -> dict[str, Any]
         labels: Labels that count as stalks, see `labels.select_stalks`; annotations with other labels are left out.
 
     Returns:
-        ``images``, each with id, file_name, width and height; ``annotations``, each with an image_id, a bbox [4] (left, top,
-        width, height in pixels) that intersects the image, and a ``segmentation``: polygons of at least 3 corners, runs that
-        cover the image, or None. If ``iscrowd`` is 1, the annotation is a region of stalks that were not separated.
-        ``summary`` states in one line what counts as a stalk.
+        ``images``, each with id, file_name, width, height and source (the annotation file); ``annotations``, each with an
+        image_id, a bbox [4] (left, top, width, height in pixels) that intersects the image, and a ``segmentation``: polygons of
+        at least 3 corners, runs that cover the image, or None. If ``iscrowd`` is 1, the annotation is a region of stalks that
+        were not separated. ``summary`` states in one line what counts as a stalk.
 
     Raises:
         RequestError: There are no annotations, they cannot be read, or one is invalid; the message says which.
@@ -123,7 +123,7 @@ def _check_image(image: dict[str, Any], index: int) -> dict[str, Any]:
 
 
 def _is_inside(name: str) -> bool:
-    """Return whether a file name in annotations is a relative path within their folder on any operating system."""
+    """Return True if a file name in annotations is a relative path within their folder on any operating system."""
     path = PureWindowsPath(name)  # splits at both separators
     steps = path.parts
     return bool(steps) and not path.anchor and ".." not in steps and name == readable(name)

@@ -19,7 +19,7 @@ from jaxrl_vis.stalks.phenotyping.io.naming.stamps import match_nearest, parse_t
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm"}
 SAMPLE = Path(__file__).parents[1] / "sample_row"
-"""Folder of a short synthetic row that ships with the package."""
+"""Folder of a short synthetic row of plants that ships with the package."""
 _MAX_DEPTH = 6  # levels of nested folders searched for plots
 _MAX_FOLDERS = 20_000
 _MAX_DELAY = 0.005  # s, maximum median delay between the images of a pair: a robot at 0.3 m/s drives 1.5 mm
@@ -331,9 +331,9 @@ def _pair_by_counter(stem: str, stems: set[str]) -> list[tuple[str, str]]:
 def _match_side(stem: str, stems: set[str]) -> re.Match[str] | None:
     """Find the word or letter of an image's name that tells its side; None if there is none.
 
-    Names of rows and repetitions may hold such letters, too, as in R2_left_000 or plot_R1_L_000. So words take precedence over
-    letters, matches whose exchange gives the name of another image over those that do not, and later matches over earlier ones,
-    as names usually begin with the plot.
+    Names of field rows and repetitions may hold such letters, too, as in R2_left_000 or plot_R1_L_000. So words take precedence
+    over letters, matches whose exchange gives the name of another image over those that do not, and later matches over earlier
+    ones, as names usually begin with the plot.
 
     Args:
         stem: Stem of the image's name.

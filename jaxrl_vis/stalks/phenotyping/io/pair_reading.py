@@ -28,7 +28,7 @@ def read_pair(pair: PairFiles, calibration: Calibration | None, right_needed: bo
         right_needed: If false and the pair has no right image, the left one is returned in both places.
 
     Raises:
-        Unusable: An image is missing, unreadable or black, or the sizes do not match.
+        UnusablePairError: An image is missing, unreadable or black, or the sizes do not match.
     """
     sides: tuple[Side, ...] = ("left",) if pair.right is None and not right_needed else ("left", "right")
     # Checked before decoding: a small file may hold more pixels than fit into memory.
@@ -55,7 +55,7 @@ def read_side(pair: PairFiles, side: Side) -> np.ndarray:
     """Read one image of a pair, RGB [H, W, 3] uint8.
 
     Raises:
-        Unusable: It is missing or unreadable.
+        UnusablePairError: It is missing or unreadable.
     """
     return to_rgb8(_read_side_file(pair, side, read_image))
 
@@ -64,7 +64,7 @@ def _read_side_file(pair: PairFiles, side: Side, read: Callable[[Path], T]) -> T
     """Return the result of ``read`` for the file of one image of a pair.
 
     Raises:
-        Unusable: There is no file, or ``read`` raises an `OSError`.
+        UnusablePairError: There is no file, or ``read`` raises an `OSError`.
     """
     path = pair.left if side == "left" else pair.right
     if path is None:
@@ -86,7 +86,7 @@ def read_known_disparity(pair: PairFiles, left: np.ndarray, scale: float) -> np.
         scale: Divisor of integer values, see `read_disparity`.
 
     Raises:
-        Unusable: The file cannot be read, or its size is not that of the image.
+        UnusablePairError: The file cannot be read, or its size is not that of the image.
     """
     if pair.disparity is None:
         return None

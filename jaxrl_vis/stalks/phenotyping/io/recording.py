@@ -43,14 +43,18 @@ _MAX_LISTED = 8
 
 @dataclasses.dataclass(frozen=True)
 class Topics:
-    """Topics of the left and right images."""
+    """Topics of a stereo pair of images.
+
+    Attributes:
+        left, right: Names of the topics, such as /stereo/left/image_rect.
+    """
 
     left: str
     right: str
 
 
 def is_recording(path: Path) -> bool:
-    """Return whether a path is a recording: a file with the suffix of a bag, or the folder of a ROS 2 bag."""
+    """Return True if a path is a recording: a file with the suffix of a bag, or the folder of a ROS 2 bag."""
     if path.is_file():
         return path.suffix.lower() in _SUFFIXES
     about = path / "metadata.yaml"

@@ -66,7 +66,7 @@ class Ground:
 
 
 def band_lines(ground: Ground | None, calibration: Calibration, distance: float, column: float) -> tuple[float, float]:
-    """Return the first and last row of the band in a column of the left image, for stalks at a ``distance`` in m.
+    """Return the first and last image row of the band in a column of the left image, for stalks at a ``distance`` in m.
 
     Without a ground plane, cameras are assumed to be level and at their usual height.
     """
@@ -88,7 +88,7 @@ def find_ground(
         left, right: Rectified greyscale images [H, W], uint8 or float32.
         calibration: Calibration of the cameras, for images of this size.
         disparity: Known disparities [H, W] float32 to use instead of matching, pixels; NaN where unknown. None to match.
-        depths: Minimum and maximum depth of matched windows, m.
+        depths: Minimum and maximum depth of matched windows, m; unused with ``disparity``.
     """
     frame = find_frame(left)
     part = (slice(*frame.lines), slice(*frame.columns))

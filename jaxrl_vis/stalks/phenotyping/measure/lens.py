@@ -1,11 +1,11 @@
-"""Range of lenses validated for counting and measuring: resolution and vertical field of view at the row."""
+"""Range of lenses validated for counting and measuring: resolution and vertical field of view at the row of plants."""
 
 import dataclasses
 
 from jaxrl_vis_envs.plants import Calibration
 
 UNTRIED = "untried lens"
-"""Flag of a plot whose images have a smaller field of view or a lower resolution at the row than the validated range."""
+"""Flag of a plot whose images have a smaller field of view or a lower resolution at the plants than the validated range."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -13,8 +13,8 @@ class LensRange:
     """Range of lenses.
 
     Attributes:
-        pixels_per_metre: Minimum resolution at the row, pixels per metre.
-        view: Minimum vertical field of view at the row, m.
+        pixels_per_metre: Minimum resolution at the row of plants, pixels per metre.
+        view: Minimum vertical field of view at the row of plants, m.
     """
 
     pixels_per_metre: float
@@ -31,7 +31,7 @@ def lens_fault(calibration: Calibration, distance: float, lines: int, validated:
 
     Args:
         calibration: Calibration of the cameras.
-        distance: Distance from the cameras to the row, m.
+        distance: Distance from the cameras to the row of plants, m.
         lines: Height of the images without black borders, pixels.
         validated: Range of validated lenses.
     """

@@ -22,21 +22,22 @@ _REACH = 0.025  # m along a stalk, within which edges are measured: sheaths and 
 
 @dataclasses.dataclass(frozen=True)
 class Measurement:
-    """Measurement of one stalk in one pair.
+    """Measurement of one stalk in one pair. Unknown numbers are NaN.
 
     Attributes:
         diameter_mm: Diameter perpendicular to the axis; None if it could not be measured, see ``reason``.
-        deviation_mm: Standard error of the diameter from edges and disparity, without the effects of occlusion and sheaths.
+        deviation_mm: Standard error of the diameter from edges and disparity, mm, without effects of occlusion and sheaths.
         line: Row of the left image at which the stalk was measured, pixels.
         column: Column of the stalk's centre line in that row, pixels.
         width: Width perpendicular to the axis, pixels.
         disparity: Disparity in that row, pixels.
         depth: Planar depth of the front surface, m.
         height: Height of the measurement above the ground, m; NaN if no ground is known.
-        lean, tilt: Angles of the stalk against the vertical of the image (positive to the right) and away from the camera, rad.
+        lean, tilt: Angles of the stalk against the vertical of the image (positive to the right) and away from the camera, rad;
+            the tilt is 0 if unknown.
         confidence: Confidence of the measurement, 0 to 1.
-        both_edges_visible: True if both edges are visible around the row. If False, the edges are extrapolated from the rest of
-            the stalk, which is usually partially occluded.
+        both_edges_visible: True if both edges are visible around that image row. If False, the edges are extrapolated from the
+            rest of the stalk, which is usually partially occluded.
         reason: Reason why the stalk could not be measured; empty if it was.
     """
 

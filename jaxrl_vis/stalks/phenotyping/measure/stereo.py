@@ -34,7 +34,7 @@ class StalkDisparity:
     Attributes:
         lines: [N] float64, centre row of each matched window.
         values: [N] float64, disparity of each, pixels.
-        scores: [N] float64, normalised cross-correlation of each, up to 1.
+        scores: [N] float64, normalised cross-correlation of each, up to 1; 1 for sampled disparities.
         window_count: Number of windows, including unmatched ones.
     """
 
@@ -134,7 +134,12 @@ def match_rows(
 
 @dataclasses.dataclass(frozen=True)
 class _Window:
-    """Window of a stalk: its centre row, first column, and end column (exclusive)."""
+    """Window of a stalk in the left image.
+
+    Attributes:
+        line: Centre row.
+        first, last: First column, and end of the columns (exclusive).
+    """
 
     line: int
     first: int
@@ -176,9 +181,9 @@ def _match_window(
 
 
 def _robust_line(matches: list[tuple[int, float]]) -> tuple[float, float] | None:
-    """Fit a robust line to (row, disparity) pairs and return its offset and slope.
+    """Fit a robust line to pairs (row, disparity) and return its offset, pixels, and slope, pixels per row.
 
-    Returns None unless at least three, and all but one, are inliers.
+    Return None unless at least three, and all but one, are inliers.
     """
     if len(matches) < 3:
         return None

@@ -18,7 +18,7 @@ from jaxrl_vis_envs.documents import read_json
 _INK, _GREY, _GREEN, _ORANGE = "#222222", "#9a9a9a", "#1a7f37", "#d1720c"
 _MAX_SHOWN = 60  # stalks in figure 3.5: more would overlap
 HUMAN_MINUTES = {"count": (3.33, 3.66), "width": (29.0, 30.0)}
-"""Minutes that two people took for a plot of 33 stalks; quoted from Table 3.1 of the thesis."""
+"""Minutes that the first and the second person took for a plot of 33 stalks; quoted from Table 3.1 of the thesis."""
 THESIS_SECONDS = 6.5
 """Seconds that the thesis's pipeline took for the same plot; quoted from the same table."""
 

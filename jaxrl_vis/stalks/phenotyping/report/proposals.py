@@ -16,7 +16,7 @@ _TOLERANCE = 0.8  # pixels, maximum deviation of the simplified outline from the
 
 
 def outline(detection: Detection) -> list[float]:
-    """Return the outline of a detection's mask within its box as x, y, x, y, ... in image pixels, the first from 0 to 1.
+    """Return the outline of a detection's mask within its box as x, y, x, y, ... in pixels; the first pixel spans 0 to 1.
 
     It encloses the outermost pixels of each row, as a stalk is a single strip. If the mask has fewer than two rows there, it is
     the box.

@@ -1,7 +1,7 @@
-"""Quality-control page: sortable tables, an image of every stalk, and rejected detections with reasons, as one HTML file.
+"""Quality-control page: sortable tables, an image of every stalk, and rejected tracks with reasons, as one HTML file.
 
 Images are cropped from the overlays written by `pipeline.run`. Plots are added one by one and buffered in a temporary file, so
-that memory use does not grow with their number; images of whole pairs are limited to about 200 in total.
+that memory use does not grow with their number; images of whole pairs are limited to about 200 in total, or one per plot.
 """
 
 import base64

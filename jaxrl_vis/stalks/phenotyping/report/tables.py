@@ -70,7 +70,13 @@ UNFAMILIAR = "unlike what the networks know"
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """Values common to all rows of a plot: its name, the method of the widths, and the software version."""
+    """Values common to all rows of a plot.
+
+    Attributes:
+        plot: Name of the plot.
+        method: Method of measuring widths.
+        version: Version of the software.
+    """
 
     plot: str
     method: str
@@ -81,6 +87,8 @@ def plot_rows(
     frames: list[list[Sighting]], tracks: list[Track], path: RobotPath, skipped: int, origin: Origin
 ) -> tuple[list[Row], Row]:
     """Compute the rows of the counted stalks of one plot, in the order of ``tracks``, and the plot's own row.
+
+    Values are text or integers, and empty text if unknown.
 
     Args:
         frames: Sightings of each pair.

@@ -44,7 +44,8 @@ def track_either_way(
 ) -> TrackedPlot:
     """Track the stalks of a plot in whichever direction the cameras moved.
 
-    If the images are consistent with a motion to the cameras' right, the result is that of `follow.track_stalks`.
+    The result is that of `follow.track_stalks`, for a motion to the cameras' right, unless clearly more sightings are linked in
+    the other direction and the images do not contradict it.
 
     Args:
         frames: Sightings of each pair, in driving order.
@@ -70,7 +71,7 @@ def _count_links(tracks: list[Track]) -> int:
 
 
 def _is_contradicted(frames: list[list[Sighting]], positions: np.ndarray) -> bool:
-    """Return whether most pairs that share stalks with the previous one contradict the path.
+    """Return True if most of the pairs that share stalks with the previous one contradict the path.
 
     Args:
         frames: Sightings of each pair.

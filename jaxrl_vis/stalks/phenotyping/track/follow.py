@@ -83,7 +83,15 @@ class RobotPath:
 
 @dataclasses.dataclass
 class _OpenTrack:
-    """Track under construction; its lists have one entry per sighting."""
+    """Track under construction; its lists have one entry per sighting.
+
+    Attributes:
+        sightings: Index of the pair, and index within its sightings.
+        along: Position along the row, m.
+        depth: Depth, m; NaN if not measured.
+        rays: Position of the left camera along the row, m, and tangent of the horizontal angle at which it sees the stalk.
+        feet: Position of the stalk's foot along the row, m.
+    """
 
     sightings: list[tuple[int, int]] = dataclasses.field(default_factory=list)
     along: list[float] = dataclasses.field(default_factory=list)
@@ -292,7 +300,10 @@ def _merge_tracks(tracks: list[_OpenTrack], gates: Gates) -> list[_OpenTrack]:
 
 
 def _one_behind(track: _OpenTrack, other: _OpenTrack) -> float:
-    """Return the distance along the row, m, between two tracks if ``track`` is placed at the depth of ``other``."""
+    """Return the distance along the row, m, between two tracks if ``track`` is placed at the depth of ``other``.
+
+    It is infinite if ``track`` has a single sighting or ``other`` no depth.
+    """
     depths = other.depths()
     if len(track.sightings) < 2 or not len(depths):
         return math.inf

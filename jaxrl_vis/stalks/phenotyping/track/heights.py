@@ -87,7 +87,7 @@ class _WidthMeasurement:
     """Diameter measured in one pair.
 
     Attributes:
-        mm, deviation: Diameter and its standard error, mm.
+        mm, deviation: Diameter and its standard error, mm; the error is None if unknown.
         height: Height of the measurement above the ground, m.
         confidence: Weight of the measurement.
         occluded: True if an edge may be occluded.

@@ -21,10 +21,10 @@ from jaxrl_vis_envs.plants.truth import HEIGHTS
 
 NO_CALIBRATION = "no calibration"
 Find = Callable[[np.ndarray, float | None, Band | None], list[Detection]]
-"""Detector of the stalks in a left image [H, W, 3] uint8, given its pixels per metre at the row and the rows of the band, both
-None if unknown."""
+"""Detector of the stalks in a left image [H, W, 3] uint8, given its pixels per metre at the row of plants and the image rows of
+the band, both None if unknown."""
 USUAL_DISTANCE = 0.8
-"""Default distance from the cameras to the row, m."""
+"""Default distance from the cameras to the row of plants, m."""
 _OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is found at the usual one
 _SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
 _AT_DISTANCE = 3  # minimum number of stalks to estimate the distance of the row
@@ -44,7 +44,7 @@ class Sighting:
             pixel.
         axis: x coordinates of its centre line at the top and bottom of the box, pixels.
         score: Score of the detector, 0 to 1.
-        line, column: Row of the measurement, and column of the stalk's centre line in it, pixels.
+        line, column: Image row of the measurement, and column of the stalk's centre line in it, pixels.
         width_px: Width perpendicular to the axis, pixels.
         lean_deg: Angle against the vertical of the image, degrees, positive to the right.
         diameter_mm: Diameter perpendicular to the axis, mm.
@@ -57,7 +57,7 @@ class Sighting:
         upper_place: Column, row and width of that measurement, pixels.
         confidence: Confidence of the measurement, 0 to 1.
         occluded, upper_occluded: True if an edge may be occluded, so that the diameter is a lower bound: another stalk touches
-            it, or, for the lower measurement, the edges are not visible around the row itself.
+            it, or, for the lower measurement, the edges are not visible around that image row.
         ray_deg: Horizontal angle between the left camera's axis and the ray to the stalk, degrees, positive to the right.
         reason: Reason why the stalk was not measured; empty if it was.
     """
@@ -117,7 +117,7 @@ _KEYS = {"occluded": "hidden", "upper_occluded": "upper_hidden"}
 
 
 def _field_kind(hint: Any) -> tuple[type | tuple[type, ...], bool, int]:
-    """Return the type of a field's values, whether it is optional, and its number of values."""
+    """Return the type of a field's values, True if it is optional, and its number of values."""
     one, optional, several = fields.unwrap(hint)
     length = next((len(get_args(part)) for part in (hint, *get_args(hint)) if get_origin(part) is tuple), 1)
     return (int, float) if one is float else one, optional, length if several else 1
@@ -146,7 +146,7 @@ def detect_with_ground(
         left, right: Rectified images [H, W, 3] uint8.
         calibration: Calibration of the cameras; None to skip the ground, and to call ``find`` without a resolution.
         disparity: Known disparities; see `find_ground`.
-        distance: Distance from the cameras to the row, m, which with the focal length gives the pixels per metre at the row.
+        distance: Distance from the cameras to the row of plants, m, which determines the pixels per metre there.
 
     Returns:
         Detections, and the ground plane, None if not found.
@@ -187,7 +187,7 @@ def view_pair(
     method: Method = "strip",
     disparity: np.ndarray | None = None,
 ) -> PairView:
-    """Detect and measure the stalks of a pair, whose row may be nearer or further away than usual.
+    """Detect and measure the stalks of a pair, whose row of plants may be nearer or further away than usual.
 
     The networks detect stalks of about one size in pixels. If stereo shows that the row is at another distance, or few stalks
     are detected, detection is repeated with images scaled for other distances.

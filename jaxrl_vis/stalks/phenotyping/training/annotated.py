@@ -30,9 +30,14 @@ _MAX_WIDTH = 2048  # pixels: maximum width of a resized image
 
 
 def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Iterator[Example]:
-    """Yield the examples of a folder of annotated images; see `read_annotations`.
+    """Yield the examples of a folder of annotated images, one for each image; see `read_annotations`.
 
     The scale of the images is taken from the calibration in the folder, if there is one.
+
+    Args:
+        folder: Folder with images and annotations.
+        settings: Settings of the networks.
+        labels: Labels that count as stalks, see `labels.select_stalks`.
 
     Raises:
         RequestError: Annotations are missing or invalid, the calibration is invalid or for images of another size, or an image
@@ -76,7 +81,9 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
 
 
 def _cover_crowds(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarray:
-    """Cover crowd regions (stalks annotated together) with overlapping strips [N, 6] float32 as wide as the image's stalks.
+    """Cover crowd regions (stalks annotated together) with overlapping strips as wide as the image's median stalk.
+
+    Strips are boxes and axes [N, 6] float32. In an image without single stalks, they are an eighth as wide as tall.
 
     Detections are ignored by their overlap with unclear stalks, and would hardly overlap the box of a whole region.
     """
@@ -98,7 +105,7 @@ def _own_masks(
     stalks: np.ndarray,
     shape: tuple[int, int],
 ) -> np.ndarray:
-    """Cut the masks of stalk crops out of annotations; see `MaskFunction`.
+    """Cut the masks of stalk crops out of annotations. With the first two arguments bound, a `MaskFunction`.
 
     One at a time: masks may overlap, and all of an image together could exceed the memory.
     """
@@ -110,7 +117,9 @@ def _own_masks(
 
 
 def _resolutions(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | None]:
-    """Return the pixels per metre at the row of each image by its id; all None if the folder has no calibration.
+    """Return the resolution of each image by its id; all None if the folder has no calibration.
+
+    Resolutions are in pixels per metre at `USUAL_DISTANCE`, the assumed distance of the plants.
 
     Raises:
         RequestError: The calibration cannot be read, or is for images of another size.
@@ -125,7 +134,10 @@ def _resolutions(folder: Path, images: list[dict[str, Any]]) -> dict[int, float 
 
 
 def fit_settings(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
-    """Return settings with anchors adapted to the boxes of a folder's annotations.
+    """Return settings adapted to the boxes of a folder's annotations.
+
+    Stalk crops become at least twice as wide as the median box, up to 512 pixels. Without sections, anchors become as tall as
+    the median box, with widths at quantiles of those of the boxes.
 
     If the folder has no calibration, images are resized so that boxes are as tall as the band, or stalks as wide as those of
     training with sections; detection with networks trained on them uses the same resizing. Stalk crops are scaled accordingly.

@@ -52,18 +52,19 @@ def _blur(values: jax.Array, deviation: jax.Array) -> jax.Array:
 def augment_geometry(
     images: jax.Array, stalks: jax.Array, kinds: jax.Array, sizes: jax.Array, key: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Mirror, shear, stretch and shift images and their stalks at random; a quarter of them may only be mirrored.
+    """Mirror, shear, stretch and shift images and their stalks at random; a quarter of the images are mirrored at most.
 
     Args:
         images: [N, H, W, 3] uint8, padded at the bottom and on the right.
-        stalks: [N, T, 6], boxes and axes, or edges [N, T, R, 3], see `sections`.
+        stalks: [N, T, 6] float32, boxes and axes, or edges [N, T, R, 3], see `sections`.
         kinds: [N, T] int32, see `losses.assign_boxes`.
         sizes: [N, 2] int32, height and width of the images without padding.
         key: Typed key, [].
 
     Returns:
-        Images, stalks clipped to them, and kinds, where stalks that are hardly left in the image become ``NOTHING``; shapes and
-        dtypes are those of the arguments.
+        Images, black where the originals did not reach; stalks; and kinds. Shapes and dtypes are those of the arguments. Boxes
+        are clipped to the image, and become ``NOTHING`` if hardly anything is left. Edges are not clipped, and their kinds are
+        unchanged: rows that leave the image become `ABSENT`, those of which less than `WHOLE` is left at most `UNKNOWN`.
     """
     keys = jax.random.split(key, images.shape[0])
     return jax.vmap(_transform_stalks)(images, stalks, kinds, sizes, keys)
@@ -145,7 +146,10 @@ def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: jax.Arr
 
 
 def augment_crops(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Augment stalk crops [N, H, W, 3] uint8 and masks [N, H, W] bool: width, texture, contrast, mirroring and lighting."""
+    """Augment stalk crops [N, H, W, 3] uint8 and their masks [N, H, W] bool; shapes and dtypes are unchanged.
+
+    Width, texture, contrast, stripes along the stalk, mirroring and lighting are random; masks follow width and mirroring.
+    """
     light, side, marks, size, contrast, along = jax.random.split(key, 6)
     crops, masks = _stretch(crops, masks, size)
     crops = _add_stripes(_change_contrast(_add_texture(crops, marks), masks, contrast), masks, along)

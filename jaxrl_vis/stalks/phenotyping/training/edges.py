@@ -11,7 +11,7 @@ from jaxrl_vis_envs.plants.field import Plot, Stalk
 from jaxrl_vis_envs.plants.truth import outline
 
 MAX_EDGES = 96
-"""Maximum number of stalks per training image, those of rows behind included; further ones are dropped."""
+"""Maximum number of stalks per training image, those of the rows of plants behind included; further ones are dropped."""
 _HEIGHTS = 160  # of the outline of a stalk
 _COLUMNS = 1600  # of the instance image that suffice to estimate visibility
 _NEAR = 0.1  # m: minimum depth of the parts of a stalk
@@ -24,10 +24,10 @@ Edges = tuple[np.ndarray, np.ndarray]
 def synthetic_edges(
     plot: Plot, pose: Pose, camera: Calibration, instance: np.ndarray, shape: tuple[int, int], scale: tuple[float, float]
 ) -> Edges:
-    """Compute the edges of the visible stalks of an image.
+    """Compute the edges of the visible stalks of an image; those with fewer than 12 pixels after resizing are dropped.
 
-    By day, stalks of rows behind look like those of the near row: they are ``UNCLEAR``. At night, they are background, as the
-    light of the flash falls off.
+    By day, stalks of the rows of plants behind look like those of the near row: they are ``UNCLEAR``. At night, they are
+    background, as the light of the flash falls off.
 
     Args:
         plot: Plot with its plants.
@@ -71,7 +71,10 @@ def synthetic_edges(
 def _sides(
     stalk: Stalk, pose: Pose, camera: Calibration, lines: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return the columns of the edges of a stalk in image rows [R], extrapolated where it is not, and where it is [R] bool."""
+    """Return the left and right columns [R] of a stalk at image rows ``lines`` [R], and a mask [R] of the rows that it reaches.
+
+    Beyond its ends, columns are extrapolated. None if all of it is nearer than `_NEAR`, or less than two pixels tall.
+    """
     heights = np.linspace(0.0, stalk.points[:, 2].max(), _HEIGHTS)
     # A tall stalk that leans over the camera has no projection there.
     heights = heights[np.interp(heights, stalk.points[:, 2], pose.to_camera(stalk.points)[:, 2]) >= _NEAR]
@@ -116,7 +119,10 @@ def cut_edges(edges: Edges, top: int, left: int, lines: int) -> Edges:
 
 
 def stack_edges(edges: Sequence[Edges | None], height: int) -> Edges:
-    """Batch the edges of N images ``height`` pixels tall: edges [N, T, R, 3] and kinds [N, T], T being `MAX_EDGES`."""
+    """Batch the edges of N images padded to ``height`` pixels: edges [N, T, R, 3] and kinds [N, T], T being `MAX_EDGES`.
+
+    Images whose edges are None have no stalks.
+    """
     rows = -(-height // STEP)
     batch, kinds = np.zeros((len(edges), MAX_EDGES, rows, 3), np.float32), np.full((len(edges), MAX_EDGES), NOTHING, np.int32)
     batch[..., 2] = ABSENT

@@ -49,7 +49,8 @@ class Example:
         kinds: [T] int32: `sections.NOTHING` (padding), ``UNCLEAR`` or ``STALK``.
         crops: Stalk crops [S, H, W, 3] uint8 at full resolution; S is not padded.
         masks: Masks [S, H, W] bool of the crops.
-        edges: Edges [T, R, 3] of the stalks in the resized image and their kinds [T]; None for networks without sections.
+        edges: Edges [E, R, 3] float32 of E stalks in the resized image and their kinds [E] int32, not padded; None for networks
+            without sections.
     """
 
     image: np.ndarray
@@ -63,7 +64,7 @@ class Example:
 def synthetic_examples(family: Family, settings: Settings, seed: int, frames: int = 4) -> list[Example]:
     """Render the training examples of one synthetic plot.
 
-    Images of a daylight family are rendered at random scales and cropped at random to the size in ``settings``.
+    Images of a daylight family are resized by random factors and cropped at random to the size in ``settings``.
 
     Args:
         family: Family from which the plot is sampled.
@@ -176,7 +177,7 @@ def _instance_masks(
     """Cut the masks of stalk crops out of an instance segmentation. With the first two arguments bound, a `MaskFunction`.
 
     Args:
-        instance: [H, W] int, index of the stalk at each pixel.
+        instance: [H, W] int, index of the stalk at each pixel, -1 or less where there is none.
         indices: [T] int, index in ``instance`` of each stalk that has a box, see `true_boxes`.
         selected: [N] int, positions in ``indices`` of the stalks whose crops are cut.
         stalks: [N or more, 6] float32, boxes and axes of these stalks; further rows are padding and are dropped.
@@ -231,10 +232,18 @@ def make_example(
     higher: float = 0.0,
     crop_scale: float = 1.0,
 ) -> Example:
-    """Build the example of an image [H, W, 3].
+    """Build the example of an image, without edges.
 
-    A fraction ``higher`` of its stalks also gets a crop around the upper height. Crops have the size of those of an image with
-    ``crop_scale`` times the ``pixels_per_metre``.
+    Args:
+        image: [H, W, 3] uint8.
+        pixels_per_metre: Resolution of the image at the row of plants; None if unknown.
+        stalks: Boxes and axes [N, 6] in continuous coordinates of the image; those beyond `MAX_STALKS` get crops only.
+        kinds: [N] int32; only those of kind ``STALK`` get a crop.
+        mask_function: Function that returns the masks of the crops.
+        settings: Settings of the networks.
+        rng: NumPy generator of the jitter of crops.
+        higher: Fraction of the stalks that also get a crop around the upper height.
+        crop_scale: Factor on ``pixels_per_metre``, if known, at which the size of crops is computed.
     """
     full_image = np.asarray(image)
     reduced, scale = resize(full_image, settings, pixels_per_metre)

@@ -91,7 +91,7 @@ def detect_in_examples(
 
 
 def true_targets(example: Example, shape: tuple[int, int], settings: Settings) -> tuple[np.ndarray, np.ndarray]:
-    """Return what the networks are to detect in an example: stalks [T, 6] or sections [B T, 6], and their kinds.
+    """Return the targets of detection in an example: stalks [T, 6], or sections [B T, 6] of B bands, and their kinds.
 
     Args:
         example: Image with true stalks.
@@ -109,7 +109,7 @@ def true_targets(example: Example, shape: tuple[int, int], settings: Settings) -
 def match_to_annotations(
     stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match detections with true stalks greedily by score, one to one, at a box overlap of at least 0.5.
+    """Match detections with true stalks greedily by score, one to one, at a box IoU of at least 0.5.
 
     Args:
         stalks: Detections [K, 6].

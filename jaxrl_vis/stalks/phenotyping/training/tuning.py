@@ -2,8 +2,8 @@
 
     read -> split by photograph -> compile -> updates, with evaluations on held-out images in between -> the best weights
 
-The time limit applies to updates only: reading and compilation are timed separately. When starting from trained weights, the
-first layers are frozen, as a few images are too few to train them.
+The time limit applies to updates and evaluations only: reading and compilation are timed separately. When starting from trained
+weights, the first layers are frozen, as a few images are too few to train them.
 """
 
 import contextlib
@@ -45,7 +45,7 @@ class Tuning:
 
     Attributes:
         steps: Maximum number of updates.
-        minutes: Maximum duration of the updates in minutes; None for no limit.
+        minutes: Maximum duration of updates and evaluations in minutes; None for no limit.
         batch: Batch size of images.
         crops: Batch size of stalk crops; 0 if masks are not trained.
         rate: Peak learning rate.
@@ -69,7 +69,8 @@ class TuningResult:
     """Result of fine-tuning.
 
     Attributes:
-        params: Best parameters, with keys ``detector`` and ``segmenter``; the last ones if no images are held out.
+        params: Best averaged parameters, with keys ``detector`` and ``segmenter``; the last ones without images for early
+            stopping.
         best_step: Number of updates after which these parameters were reached.
         updates: Total number of updates.
         stop_reason: Reason why training ended.
@@ -109,10 +110,11 @@ def tune(
             early stopping, called with the latest parameters at each evaluation.
 
     Returns:
-        The parameters, on the host, with the best score on the images for early stopping, or the last ones without such images.
+        Result, whose parameters are on the host: those with the best score on the images for early stopping, which may be the
+        initial ones, or the last ones without such images.
 
     Raises:
-        NonFiniteError: A loss is not finite.
+        NonFiniteError: A loss is not finite when it is reported or held-out images are evaluated.
     """
     dtype = jnp.bfloat16 if jax.default_backend() in ("gpu", "tpu") else jnp.float32
     frozen = ((*FROZEN,) if start is not None else ()) + (() if tuning.crops else ("segmenter",))

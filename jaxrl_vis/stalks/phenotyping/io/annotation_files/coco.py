@@ -7,7 +7,7 @@ from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, A
 
 
 def is_coco(data: Any) -> bool:
-    """Return whether parsed JSON is a COCO data set."""
+    """Return True if parsed JSON is a COCO data set."""
     return isinstance(data, dict) and "images" in data and "annotations" in data
 
 

@@ -154,9 +154,9 @@ def _class_names(folder: Path) -> list[str]:
 
 
 def _walk_files(folder: Path, suffixes: set[str]) -> Iterator[Path]:
-    """Yield the files with some suffixes in a folder and its subfolders, sorted by name, except those of held-out data.
+    """Yield the files with some suffixes in a folder and up to three levels of subfolders, sorted by name within each.
 
-    Hidden files and folders, folders called ``truth`` and unreadable folders are skipped.
+    Folders of held-out data, hidden files and folders, folders called ``truth`` and unreadable folders are skipped.
 
     Raises:
         RequestError: There are more than 200,000.

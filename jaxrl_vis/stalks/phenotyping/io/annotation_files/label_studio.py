@@ -16,7 +16,7 @@ from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import (
 
 
 def is_label_studio(data: Any) -> bool:
-    """Return whether parsed JSON is an export of Label Studio, as JSON or JSON-MIN."""
+    """Return True if parsed JSON is an export of Label Studio, as JSON or JSON-MIN."""
     return isinstance(data, list) and bool(data) and all(isinstance(task, dict) and _image_name(task) for task in data[:20])
 
 

@@ -18,7 +18,7 @@ _CORNERS = {"polygon": 3, "rectangle": 2, "rotation": 4}
 
 
 def is_labelme(data: Any) -> bool:
-    """Return whether parsed JSON is a LabelMe file."""
+    """Return True if parsed JSON is a LabelMe file."""
     return isinstance(data, dict) and "shapes" in data
 
 

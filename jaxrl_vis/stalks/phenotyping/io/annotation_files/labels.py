@@ -52,7 +52,7 @@ def select_stalks(annotations: list[dict[str, Any]], labels: Sequence[str], sour
 
 
 def _names_a_stalk(name: str) -> bool:
-    """Return whether a label means stalk and nothing else: ``stalk_2`` and ``sorghum stalk`` do, ``not stalk`` does not."""
+    """Return True if a label means stalk and nothing else: ``stalk_2`` and ``sorghum stalk`` do, ``not stalk`` does not."""
     words = {word for word in re.split(r"[^a-z]+", name.casefold()) if word}
     return bool(words & _STALKS) and words <= _STALKS | _CROPS
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 Annotation = dict[str, Any]
-"""``name``, ``source``, and ``bbox`` and ``segmentation`` as in COCO; or ``problem``: why the shape cannot be a stalk."""
+"""Annotation of one shape by key: label ``name``, ``source`` (for messages), ``group`` (see `merge_groups`), and ``bbox`` and
+``segmentation`` as in COCO; or, instead of these two, ``problem``: reason why the shape cannot be a stalk."""
 
 
 @dataclasses.dataclass
@@ -15,7 +16,7 @@ class Annotated:
     """An image with its annotations.
 
     Attributes:
-        name: Name of the image file, as written in the annotations.
+        name: Name of the image file, as written in the annotations; if `gather` found the file, its path in the folder.
         width, height: Size in pixels; None if the annotations do not state it.
         source: The annotation file.
         annotations: Annotations of the image.
@@ -32,7 +33,10 @@ _NO_WIDTH = "which has no width: draw it as a polygon or a rectangle"
 
 
 def from_outline(name: str, points: np.ndarray, source: str, group: Any = None) -> Annotation:
-    """Return a polygon annotation with corners [N, 2] in pixels and their bounding box; nothing is checked."""
+    """Return a polygon annotation with corners [N, 2] in pixels and their bounding box; nothing is checked.
+
+    ``source`` names it in messages; polygons with the same ``group`` are merged by `merge_groups`, None for none.
+    """
     low, high = points.min(axis=0), points.max(axis=0)
     with np.errstate(over="ignore", invalid="ignore"):
         box = [*map(float, low), *map(float, high - low)]

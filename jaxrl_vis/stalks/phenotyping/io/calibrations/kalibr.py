@@ -12,7 +12,7 @@ _MODELS = {"radtan": False, "plumb_bob": False, "equidistant": True, "none": Fal
 
 
 def is_chain(store: dict[str, Any]) -> bool:
-    """Return whether parsed YAML is a kalibr camera chain."""
+    """Return True if parsed YAML is a kalibr camera chain."""
     return isinstance(store.get("cam0"), dict) and "intrinsics" in store["cam0"]
 
 

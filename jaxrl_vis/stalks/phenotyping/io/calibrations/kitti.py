@@ -17,7 +17,7 @@ _FOLDER = re.compile(r"image_?0?([0-3])$")
 
 
 def is_kitti(text: str) -> bool:
-    """Return whether a text is a KITTI calibration."""
+    """Return True if a text is a KITTI calibration."""
     return any(name != "S_rect_0" for name, _, _ in _LINE.findall(text))
 
 

@@ -12,7 +12,7 @@ _LINE = re.compile(r"^\s*([A-Za-z]\w*)\s*=\s*(.*?)\s*$", re.MULTILINE)
 
 
 def is_middlebury(text: str) -> bool:
-    """Return whether a text is a Middlebury calibration."""
+    """Return True if a text is a Middlebury calibration."""
     return re.search(r"^\s*cam0\s*=\s*\[", text, re.MULTILINE) is not None
 
 

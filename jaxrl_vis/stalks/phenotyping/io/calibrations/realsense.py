@@ -14,7 +14,7 @@ _MODES = 64
 
 
 def is_calibration_table(store: dict[str, Any]) -> bool:
-    """Return whether parsed JSON is a RealSense calibration table."""
+    """Return True if parsed JSON is a RealSense calibration table."""
     return "baseline" in store and any(name.startswith(("rectified.", "intrinsic_left.")) for name in store)
 
 

@@ -55,7 +55,7 @@ def strip_preamble(text: str) -> str:
 
 
 def is_camera(store: dict[str, Any]) -> bool:
-    """Return whether the contents of a file are those of one ROS camera."""
+    """Return True if the contents of a file are those of one ROS camera."""
     return any(store.get(name) is not None for name in _MATRIX_NAMES)
 
 

@@ -23,7 +23,7 @@ _SIZES: dict[str, Size] = {
 
 
 def is_settings(text: str) -> bool:
-    """Return whether a text is a calibration of a ZED camera."""
+    """Return True if a text is a calibration of a ZED camera."""
     return "[LEFT_CAM_" in text and "[STEREO]" in text
 
 

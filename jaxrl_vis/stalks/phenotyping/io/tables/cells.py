@@ -38,7 +38,8 @@ def split_cells(path: Path, text: str) -> tuple[list[str], list[tuple[int, list[
         text: Its contents.
 
     Returns:
-        Names of the columns; the non-empty rows with their line numbers; and whether commas in numbers are decimal separators.
+        Names of the columns; the non-empty rows with their line numbers; and a boolean, True if commas in numbers are decimal
+        separators.
 
     Raises:
         RequestError: The text is not a table.
