@@ -131,11 +131,11 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
     points: list[Row] = []
     skipped: list[Row] = []
     (request.out / "runs").mkdir(exist_ok=True)
-    for folder in runs:
-        path = request.out / "runs" / file_name(f"{folder.name}.json")
-        sources = _sources(folder)  # before the files are read: they may be replaced meanwhile
+    for plot in runs:
+        path = request.out / "runs" / file_name(f"{plot.name}.json")
+        sources = _sources(plot)  # before the files are read: they may be replaced meanwhile
         if not is_current(path, sources, _is_complete):
-            write_record(path, _make_record(folder, driven[folder.name], find, request), sources)
+            write_record(path, _make_record(plot, driven[plot.name], find, request), sources)
         record = read_json(path)
         rows, points, skipped = [*rows, record["row"]], points + record["points"], skipped + record["skipped"]
         write_rows(request.out / "runs.csv", RUN_COLUMNS, rows)
@@ -145,11 +145,11 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
     return skipped
 
 
-def _sources(folder: PlotFolder) -> dict[str, Any]:
+def _sources(plot: PlotFolder) -> dict[str, Any]:
     """Return the state of the files that the record of a run depends on: its odometry.csv and the files of each pair."""
     return {
-        "odometry": file_state(folder.folder / "odometry.csv"),
-        "pairs": {pair.name: pair_state(pair) for pair in folder.pairs},
+        "odometry": file_state(plot.folder / "odometry.csv"),
+        "pairs": {pair.name: pair_state(pair) for pair in plot.pairs},
     }
 
 
@@ -159,11 +159,11 @@ def _is_complete(record: dict[str, Any]) -> bool:
     return known and record["skipped"] == []
 
 
-def _make_record(folder: PlotFolder, distances: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:
+def _make_record(plot: PlotFolder, distances: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:
     """Compute the record of one run, and write its overlay.
 
     Args:
-        folder: Folder of the run.
+        plot: Folder of the run.
         distances: Distance driven at each pair by the pair's name, m; None if unknown.
         find: Function that returns the mask of a pair.
         request: The request.
@@ -171,26 +171,26 @@ def _make_record(folder: PlotFolder, distances: dict[str, float] | None, find: F
     Returns:
         The row of the run, and the rows of its points and of skipped pairs.
     """
-    calibration = request.calibrations[folder.name]
+    calibration = request.calibrations[plot.name]
     views: list[View] = []
     skipped: list[Row] = []
-    for number, pair in enumerate(folder.pairs):
+    for number, pair in enumerate(plot.pairs):
         try:
             left, right = read_pair(pair, calibration)
         except UnusablePairError as problem:
-            skipped.append({"run": folder.name, "pair": pair.name, "why": str(problem)})
+            skipped.append({"run": plot.name, "pair": pair.name, "why": str(problem)})
             continue
         views.append(View(number, left, right, None if distances is None else distances.get(pair.name)))
     if not views:
-        return {"row": _make_row(folder, request, len(skipped), None, views), "points": [], "skipped": skipped}
+        return {"row": _make_row(plot, request, len(skipped), None, views), "points": [], "skipped": skipped}
     perception = perceive(
-        views, lambda image, number: find(image, folder, folder.pairs[number]), calibration, request.mount, request.variant
+        views, lambda image, number: find(image, plot, plot.pairs[number]), calibration, request.mount, request.variant
     )
     (request.out / "overlays").mkdir(exist_ok=True)
     overlay = draw_points(views[-1].left, perception, calibration, request.mount)
-    write_image(request.out / "overlays" / file_name(f"{folder.name}.png"), overlay)
-    points = _point_rows(folder, request, perception)
-    return {"row": _make_row(folder, request, len(skipped), perception, views), "points": points, "skipped": skipped}
+    write_image(request.out / "overlays" / file_name(f"{plot.name}.png"), overlay)
+    points = _point_rows(plot, request, perception)
+    return {"row": _make_row(plot, request, len(skipped), perception, views), "points": points, "skipped": skipped}
 
 
 def _can_reach(request: Request, perception: Perception) -> np.ndarray | None:
@@ -202,10 +202,10 @@ def _can_reach(request: Request, perception: Perception) -> np.ndarray | None:
     return np.asarray(request.reachable(points, stops), bool)
 
 
-def _make_row(folder: PlotFolder, request: Request, skipped: int, perception: Perception | None, views: list[View]) -> Row:
+def _make_row(plot: PlotFolder, request: Request, skipped: int, perception: Perception | None, views: list[View]) -> Row:
     """Return the row of runs.csv for a run; ``perception`` is None if none of its pairs was usable."""
     row: Row = dict.fromkeys(RUN_COLUMNS, "")
-    row |= {"run": folder.name, "pairs": len(views), "pairs_skipped": skipped, "grasp_points": 0}
+    row |= {"run": plot.name, "pairs": len(views), "pairs_skipped": skipped, "grasp_points": 0}
     row |= {"method": request.method, "version": jaxrl_vis.__version__}
     if perception is None:
         return row | {"flag": "no usable pairs"}
@@ -227,7 +227,7 @@ def _make_row(folder: PlotFolder, request: Request, skipped: int, perception: Pe
     }
 
 
-def _point_rows(folder: PlotFolder, request: Request, perception: Perception) -> list[Row]:
+def _point_rows(plot: PlotFolder, request: Request, perception: Perception) -> list[Row]:
     """Return the rows of points.csv for the grasp points of a run, in the robot frame of its last pair."""
     can = _can_reach(request, perception)
     rows = []
@@ -235,7 +235,7 @@ def _point_rows(folder: PlotFolder, request: Request, perception: Perception) ->
         x, y, z = point.point
         rows.append(
             {
-                "run": folder.name,
+                "run": plot.name,
                 "point": index + 1,
                 "x_m": f"{x:.4f}",
                 "y_m": f"{y:.4f}",
