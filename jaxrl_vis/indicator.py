@@ -119,8 +119,8 @@ class Learner:
         self._replay = Replay(capacity, 1, horizon)
         self._sampler = Sampler(self.config, resolved, self._replay, threshold)
         self._key = jax.random.key(self.config.run.seed)
-        self._train = TrainState(jax.jit(self._algorithm.init)(self._key), normalizer.init(self._spec))
-        self._state: ReplayState = self._replay.init(self._spec, max(1, state_size), action_size)
+        self._train_state = TrainState(jax.jit(self._algorithm.init)(self._key), normalizer.init(self._spec))
+        self._replay_state: ReplayState = self._replay.init(self._spec, max(1, state_size), action_size)
         self._updates: dict[int, Callable[..., Any]] = {}
         self.episodes, self._calls = 0, 0
 
@@ -157,7 +157,7 @@ class Learner:
             states=self._check_array("states", true, shape, np.dtype(np.float32))[None],  # type: ignore[arg-type]
             actions=np.clip(done, -1.0, 1.0)[None],  # type: ignore[arg-type]
         )
-        self._state, self._train = self._insert(self._state, self._train, episode, self.episodes)
+        self._replay_state, self._train_state = self._insert(self._replay_state, self._train_state, episode, self.episodes)
         self.episodes += 1
 
     @functools.cached_property
@@ -188,7 +188,7 @@ class Learner:
 
         key = jax.random.fold_in(jax.random.fold_in(self._key, _CALL), self._calls)
         compiled = self._updates.setdefault(count, jax.jit(update, donate_argnums=0))
-        self._train, metrics = compiled(self._train, self._state, key, self.episodes - 1)
+        self._train_state, metrics = compiled(self._train_state, self._replay_state, key, self.episodes - 1)
         self._calls += 1
         unknown = () if self._state_size else _NEED_TRUTH
         known = {name: value for name, value in metrics.items() if not name.removeprefix("train/").startswith(unknown)}
@@ -204,7 +204,7 @@ class Learner:
         seen, aim = (
             self._check_array(*pair, self._observation_shape, dtype) for pair in (("observation", observation), ("goal", goal))
         )
-        return np.asarray(self._act(self._train, _planar(seen)[None], _planar(aim)[None])[0])
+        return np.asarray(self._act(self._train_state, _planar(seen)[None], _planar(aim)[None])[0])
 
     @functools.cached_property
     def _act(self) -> Callable[..., jax.Array]:
