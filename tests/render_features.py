@@ -298,7 +298,7 @@ def _views() -> dict[str, Feature]:
 FEATURES: dict[str, Feature] = {**_geoms(), **_lights(), **_textures(), **_views()}
 
 
-def truth_of(feature: Feature) -> Feature:
+def for_mujoco_renderer(feature: Feature) -> Feature:
     """Return the feature for MuJoCo's own renderer, with its stand-in applied; itself if it has none."""
     return dataclasses.replace(feature, lights=feature.lights.replace(*feature.stand_in)) if feature.stand_in else feature
 

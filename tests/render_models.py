@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
-from render_features import FEATURES, scene_spec, truth_of
+from render_features import FEATURES, for_mujoco_renderer, scene_spec
 
 import jaxrl_vis_envs
 from jaxrl_vis.bench.scenes.models import forward, scatter_joints
@@ -163,7 +163,7 @@ def build(name: str, truth: bool = False) -> tuple[mujoco.MjModel, int]:
     entry = MODELS[name]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # deprecated attributes in other people's models
-        spec = scene_spec(truth_of(FEATURES[name])) if truth and name in FEATURES else entry.load()
+        spec = scene_spec(for_mujoco_renderer(FEATURES[name])) if truth and name in FEATURES else entry.load()
         if entry.camera is None:
             _add_camera(spec, entry.view)
         mj_model = spec.compile()

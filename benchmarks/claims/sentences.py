@@ -19,7 +19,7 @@ DECAY, RESULTS = "docs/lab/target_decay.md", "docs/lab/results.md"
 GUIDE, REWARDS = ol_aux.GUIDE, indicator.GUIDE
 
 
-def _all(verdict: str, records: Sequence[Record], reference: Record) -> bool:
+def _all_have_verdict(verdict: str, records: Sequence[Record], reference: Record) -> bool:
     return all(c.verdict(record, reference) == verdict for record in records)
 
 
@@ -238,7 +238,7 @@ def _parts_of_the_method() -> Iterator[Sentence]:
     run = indicator.run
     others = [run(REACHER, name) for name in ("autoencoder", "indicator", OURS)]
     quote = "On Reacher the four are level"
-    yield Sentence(RULES, quote, others[2].name, _all("level", others, run(REACHER, "oracle")))
+    yield Sentence(RULES, quote, others[2].name, _all_have_verdict("level", others, run(REACHER, "oracle")))
     quote = "with and without it the method is level on both"
     pairs = [c.verdict(run(task, OURS), run(task, "balance_only")) for task in (REACHER, FETCH)]
     yield Sentence(RULES, quote, run(FETCH, "balance_only").name, pairs == ["level"] * 2)
@@ -254,9 +254,11 @@ def _parts_of_the_method() -> Iterator[Sentence]:
     yield Sentence(RULES, f"{ratio:.0f} times as precisely as by the oracle", run(fetch, OURS).name)
     states = [run("Reacher", name) for name in ("indicator", OURS)]
     quote = "On Reacher indicator methods are level with the oracle over training"
-    yield Sentence(RULES, quote, states[1].name, _all("level", states, run("Reacher", "oracle")))
+    yield Sentence(RULES, quote, states[1].name, _all_have_verdict("level", states, run("Reacher", "oracle")))
     ablated = ("all_next", "all_relabelled")
-    worse = all(_all("worse", [run(task, name) for name in ablated], run(task, "oracle")) for task in ("Reacher", fetch))
+    worse = all(
+        _all_have_verdict("worse", [run(task, name) for name in ablated], run(task, "oracle")) for task in ("Reacher", fetch)
+    )
     yield Sentence(RULES, "Both ablations are worse than the oracle on either task", run(fetch, OURS).name, worse)
     level = [
         c.verdict(run(FETCH, f"{who}_{how}"), run(FETCH, plain))

@@ -9,7 +9,7 @@ from scipy.stats import binomtest
 from jaxrl_vis.stalks.grasping.evaluation import grasp_score
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import (
     Attempt,
-    Standing,
+    TrueStalk,
     match_grasps,
     score,
     thesis_ratio,
@@ -21,8 +21,8 @@ def held(*stalks: int) -> frozenset[int]:
     return frozenset(stalks)
 
 
-def stand(stalk: int, run: int = 0, reachable: bool = True, room: float = 0.02, neighbour: float = 0.06) -> Standing:
-    return Standing(run, stalk, reachable, room, neighbour)
+def stand(stalk: int, run: int = 0, reachable: bool = True, room: float = 0.02, neighbour: float = 0.06) -> TrueStalk:
+    return TrueStalk(run, stalk, reachable, room, neighbour)
 
 
 def test_wilson_is_that_of_scipy():

@@ -258,7 +258,7 @@ class _Verifier:
             repeater.repeat("the seed", 0, seed, programs.init(programs.run_keys), compared_iterations)
         for number in starts:
             self._repeat_after(number, repeater, iterations)
-        self._print_remaining(repeater.repeated)
+        self._note_unverified(repeater.repeated)
         return repeater
 
     def _repeat_after(self, number: int, repeater: Repeater, iterations: int | None) -> None:
@@ -304,7 +304,7 @@ class _Verifier:
         near = [number for number in compared_iterations if number <= first_iteration + iterations]
         return near or compared_iterations[:1]
 
-    def _print_remaining(self, repeated: set[int]) -> None:
+    def _note_unverified(self, repeated: set[int]) -> None:
         """Report rows and checkpoints that no repetition has reached."""
         unverified = self._report.unverified
         rest = [row["iteration"] for row in self._rows if row["iteration"] not in repeated]

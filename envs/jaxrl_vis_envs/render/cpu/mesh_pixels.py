@@ -26,12 +26,12 @@ class MeshPixels(NamedTuple):
     """Nearest triangles, as if there were no primitives, [blocks, P] int32 each.
 
     Attributes:
-        bits: Bit pattern of the float32 depth, its lowest bits replaced; that of the far plane where there is no triangle.
+        depth_bits: Bit pattern of the float32 depth, its lowest bits replaced; that of the far plane if there is no triangle.
         owner: Row of the object in the table of objects, -1 where there is no triangle.
         colour: Packed colour where there is a triangle; None without colours.
     """
 
-    bits: jax.Array
+    depth_bits: jax.Array
     owner: jax.Array
     colour: jax.Array | None
 
@@ -42,7 +42,7 @@ def draw(
     light_table: jax.Array | None,
     rays: Rays,
     layout: blocks.Layout,
-    bits: int,
+    colour_bits: int,
 ) -> MeshPixels:
     """Find and shade the nearest triangles of opaque objects.
 
@@ -52,7 +52,7 @@ def draw(
         light_table: Lights, from `lights.pack`; None without colours.
         rays: [blocks, P], those of all pixels.
         layout: Order of the pixels.
-        bits: Bits per channel of a packed colour.
+        colour_bits: Bits per channel of a packed colour.
     """
     far = jnp.broadcast_to(scene.zfar, rays.u.shape)
     depth, triangle, owner = raster.nearest_triangle(scene, unit, far, layout)
@@ -61,12 +61,12 @@ def draw(
     near = jnp.where(owner >= 0, middle, jax.lax.bitcast_convert_type(far, jnp.int32))
     if light_table is None:
         return MeshPixels(near, owner, None)
-    colour = sequential_vmap(functools.partial(_colour, bits))(scene, unit, light_table, rays, near, triangle, owner)
+    colour = sequential_vmap(functools.partial(_colour, colour_bits))(scene, unit, light_table, rays, near, triangle, owner)
     return MeshPixels(near, owner, colour)
 
 
 def _colour(
-    bits: int,
+    colour_bits: int,
     scene: Scene,
     unit: shapes.UnitShapes,
     light_table: jax.Array,
@@ -91,14 +91,14 @@ def _colour(
         own = Rays(rays.u[pixel], rays.v[pixel])
         row, depth = lookup.fetch(table, owner[pixel]), jax.lax.bitcast_convert_type(near[pixel], jnp.float32)
         hit = surface.meet(scene, row, lookup.fetch_triangle(scene, triangle[pixel]), own, depth)
-        return step + 1, plane.at[pixel].set(pack(shade.shade(scene, unit, unpacked, row, hit, own), bits))
+        return step + 1, plane.at[pixel].set(pack(shade.shade(scene, unit, unpacked, row, hit, own), colour_bits))
 
     start = (jnp.zeros((), jnp.int32), jnp.zeros_like(owner))
     _, plane = jax.lax.while_loop(lambda state: state[0] * _PIXELS < counts[last], colour_pixels, start)
     return plane.reshape(shape)
 
 
-def put_in_front(
+def merge_triangles(
     scene: Scene, pixels: MeshPixels, key: jax.Array, row: jax.Array | None, labelled: bool
 ) -> tuple[jax.Array, jax.Array | None]:
     """Replace the keys and rows of primitives (see `tiles.nearest_key`) by those of nearer triangles, [P] int32 each.
@@ -107,8 +107,8 @@ def put_in_front(
     """
     is_triangle = pixels.owner >= 0
     if row is not None:
-        is_nearer = is_triangle & (pixels.bits <= key)
-        return jnp.where(is_nearer, pixels.bits, key), jnp.where(is_nearer, pixels.owner, row)
+        is_nearer = is_triangle & (pixels.depth_bits <= key)
+        return jnp.where(is_nearer, pixels.depth_bits, key), jnp.where(is_nearer, pixels.owner, row)
     mask = raycast.code_mask(scene) if labelled else 0
-    own = (pixels.bits & ~mask) | (pixels.owner & mask)
+    own = (pixels.depth_bits & ~mask) | (pixels.owner & mask)
     return jnp.where(is_triangle, jnp.minimum(key, own), key), None

@@ -130,7 +130,7 @@ def _render_tiles(
         rays, visible, mesh = pixels
         key, row, own_keys = tiles.nearest_key(scene, unit, rays, visible, tile.own_keys, labelled)
         if mesh is not None:
-            key, row = mesh_pixels.put_in_front(scene, mesh, key, row, labelled)
+            key, row = mesh_pixels.merge_triangles(scene, mesh, key, row, labelled)
         tile = tile._replace(key=key, row=row, own_keys=own_keys)
         if sheet_rows:
             mask = raycast.code_mask(scene) if labelled else 0

@@ -50,7 +50,7 @@ class _Views(NamedTuple):
     depth: jax.Array
 
 
-class _List(NamedTuple):
+class _ImageBatch(NamedTuple):
     """Images whose triangles are in one list, G.
 
     Attributes:
@@ -190,7 +190,7 @@ def _search_list(scene: Scene, layout: blocks.Layout, views: _Views) -> tuple[ja
     visible, lens, rays = jax.vmap(see)(*views)
     ends = jnp.cumsum(visible.ravel().astype(jnp.int32), dtype=jnp.int32)
     axes, origin = views.unit.axes.reshape(-1, 3, 3), views.unit.origin.reshape(-1, 3)
-    listed = _List(scene, ends, axes, origin, lens, jax.tree.map(jnp.ravel, rays), places)
+    listed = _ImageBatch(scene, ends, axes, origin, lens, jax.tree.map(jnp.ravel, rays), places)
     clusters, pairs = (size * len(views.depth) for size in (_CLUSTERS, _PAIRS))
 
     def draw_clusters(step: jax.Array, image: tuple) -> tuple:
@@ -215,7 +215,7 @@ def _get(array: jax.Array, index: jax.Array) -> jax.Array:
     return array.at[index].get(mode="promise_in_bounds")
 
 
-def _make_chunk(listed: _List, ordinals: jax.Array) -> _Chunk:
+def _make_chunk(listed: _ImageBatch, ordinals: jax.Array) -> _Chunk:
     """Return the clusters with numbers ``ordinals`` [Q] in the list. Those beyond its end have triangles without pixels."""
     scene, count = listed.scene, listed.scene.cluster_places.shape[0]
     element = jnp.minimum(triangles.kth(listed.ends, ordinals), len(listed.ends) - 1)
@@ -283,7 +283,7 @@ def _find_triangle(ends: jax.Array, ordinals: jax.Array) -> jax.Array:
 
 
 def _draw_pairs(
-    listed: _List, chunk: _Chunk, ordinals: jax.Array, best: jax.Array, index: jax.Array
+    listed: _ImageBatch, chunk: _Chunk, ordinals: jax.Array, best: jax.Array, index: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Draw pairs of a triangle and a pixel.
 

@@ -22,7 +22,7 @@ from jaxrl_vis.stalks.grasping.arm.policy_loop import HEIGHTS as POLICY_HEIGHTS
 from jaxrl_vis.stalks.grasping.arm.policy_loop import STALKS as POLICY_STALKS
 from jaxrl_vis.stalks.grasping.arm.policy_loop import reach_by_policy
 from jaxrl_vis.stalks.grasping.arm.reach import ArmView, ReachResult, reach
-from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Standing, match_grasps
+from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, TrueStalk, match_grasps
 from jaxrl_vis.stalks.grasping.evaluation.scoring import RADIUS, Scene, driven_stretch
 from jaxrl_vis.stalks.grasping.perception.lines import PREFERRED, GraspPoint
 from jaxrl_vis.stalks.grasping.perception.perceive import Perception
@@ -76,7 +76,7 @@ class Plan:
     refused: np.ndarray
     redetection_errors: np.ndarray
     stands: Stands
-    standing: tuple[Standing, ...]
+    standing: tuple[TrueStalk, ...]
     detected: Stands | None = None
 
 
@@ -191,7 +191,7 @@ def reachable_from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray
     return np.asarray(approach.reachable(masts[:, None], points[None]).any(axis=0))
 
 
-def _true_stalks(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, ...]:
+def _true_stalks(plot: Plot, origins: np.ndarray, number: int) -> tuple[TrueStalk, ...]:
     """Return the true stalks of the stretch that the run passes, with their reachability and room at the preferred height.
 
     Args:
@@ -209,7 +209,7 @@ def _true_stalks(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing
         others = np.arange(len(middles)) != index
         best = approach.best_approach(origins, middle, middles[others, :2], radii[others], enough=np.inf)
         distances = np.linalg.norm(middles[others, :2] - middle[:2], axis=1)
-        standing.append(Standing(number, index, best.stop >= 0, best.room, float(distances.min(initial=np.inf))))
+        standing.append(TrueStalk(number, index, best.stop >= 0, best.room, float(distances.min(initial=np.inf))))
     return tuple(standing)
 
 

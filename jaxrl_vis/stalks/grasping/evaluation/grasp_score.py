@@ -65,7 +65,7 @@ class Attempt:
 
 
 @dataclasses.dataclass(frozen=True)
-class Standing:
+class TrueStalk:
     """Ground truth of one stalk of the stretch that a run passes.
 
     Attributes:
@@ -221,7 +221,7 @@ def match_grasps(points: np.ndarray, stalks: np.ndarray, gate: float) -> np.ndar
     return matched
 
 
-def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: float = 0.015) -> Score:
+def score(attempts: Iterable[Attempt], stalks: Iterable[TrueStalk], tolerance: float = 0.015) -> Score:
     """Score attempts against the ground truth.
 
     Args:

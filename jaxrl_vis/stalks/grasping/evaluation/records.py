@@ -19,7 +19,7 @@ from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate
 from jaxrl_vis.run.trained.policy import Policy
 from jaxrl_vis.stalks.digests import value_digest
 from jaxrl_vis.stalks.grasping.evaluation.attempts import Loop, Plan, execute_plans, plan
-from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Score, Standing, score
+from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Score, TrueStalk, score
 from jaxrl_vis.stalks.grasping.evaluation.scoring import MaskScore, RunScore, draw_scene, score_scene, summarise_scores
 from jaxrl_vis.stalks.grasping.masks.loading import load_painter
 from jaxrl_vis.stalks.grasping.perception.perceive import Variant
@@ -276,7 +276,7 @@ def read_plan(number: int, record: Record, name: str = "plan") -> Plan:
         redetection_errors=np.array(values["again"], float).reshape(-1, 2),
         stands=_read_stands(values["stands"]),
         standing=tuple(
-            Standing(number, stalk, reachable, *(np.inf if length is None else length for length in (room, neighbour)))
+            TrueStalk(number, stalk, reachable, *(np.inf if length is None else length for length in (room, neighbour)))
             for stalk, reachable, room, neighbour in values["standing"]
         ),
         detected=None if values["seen"] is None else _read_stands(values["seen"]),

@@ -204,7 +204,7 @@ def _parse_printed(path: Path, text: str) -> _Table | None:
         stamps = [int(stamp[1]) + int(stamp[2]) * 1e-9 for stamp, _ in rows if stamp is not None]
         times = np.array(stamps) - stamps[0] if len(stamps) == len(rows) else None
         metres = places if pattern is _PRINTED_PLACE else _project_to_plane(places)
-        return _Table(path, None, times, stamps[0] if times is not None else 0.0, _project_on_path(metres))
+        return _Table(path, None, times, stamps[0] if times is not None else 0.0, _distances_along_line(metres))
     return None
 
 
@@ -234,7 +234,9 @@ def _parse_table(path: Path, text: str) -> _Table:
         distances = column(metres[0][0]) * metres[0][1]
     elif places is not None:
         values = np.stack([column(columns.index(name)) for name in places if name in columns], axis=1)
-        distances = _project_on_path(_project_to_plane(values) if places in _GLOBE else values) if len(values) else np.zeros(0)
+        distances = (
+            _distances_along_line(_project_to_plane(values) if places in _GLOBE else values) if len(values) else np.zeros(0)
+        )
     times, start = None, 0.0
     if time is not None and (distances is None or names is None):
         times, start = _parse_seconds(column(time), columns[time], path)
@@ -278,7 +280,7 @@ def _project_to_plane(degrees: np.ndarray) -> np.ndarray:
     return _EARTH_RADIUS * np.stack([turned[:, 0], turned[:, 1] * np.cos(np.radians(degrees[:1, 0]))], axis=1)
 
 
-def _project_on_path(positions: np.ndarray) -> np.ndarray:
+def _distances_along_line(positions: np.ndarray) -> np.ndarray:
     """Return distances [N] along the straight line fitted to positions [N, 2 or 3], from the first one; NaN if any is invalid.
 
     Lateral deviations from the line do not count. The direction of travel is positive.
