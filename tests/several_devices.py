@@ -37,7 +37,7 @@ COLLECTIVES = ("all-reduce", "all-gather", "all-to-all", "collective-permute", "
 class Emulated(Layout):
     """Layout with the shards of each learner side by side on one device: the same functions, mapped by `jax.vmap`."""
 
-    def spread(self, function, in_specs, out_specs, jit, kept_as=None, **options):
+    def spread(self, function, in_specs, out_specs, jit, final_specs=None, **options):
         count = self.shards.count
 
         def split(spec, leaf):

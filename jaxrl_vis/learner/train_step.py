@@ -274,16 +274,16 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         return jax.vmap(lambda key: iterations.split_key(key, iteration)[0])(keys)
 
     def play_part(train: TrainState, keys: jax.Array, first: jax.Array, exploration: Exploration) -> PartResult:
-        draws = RolloutPart(first, config.run.num_envs) if plays_parts else shards
-        episodes, outcome, _ = play(acting, train, keys, num_played, exploration, draws=draws)
+        random_source = RolloutPart(first, config.run.num_envs) if plays_parts else shards
+        episodes, outcome, _ = play(acting, train, keys, num_played, exploration, random_source=random_source)
         return episodes, outcome
 
     learn = iterations.make_learn(config, insert, algorithm, sampler, layout)
     seeds, environments, replicated = layout.by_seed, layout.by_environment, layout.replicated
-    host = layout.read_by_host
+    host = layout.host_spec
 
-    def spread(name: str, function: Any, in_specs: tuple, out_specs: Any, kept_as: Any = None) -> Any:
-        return layout.spread(function, in_specs, out_specs, jaxrl_vis_envs.jit, kept_as, **JIT_OPTIONS.get(name, {}))
+    def spread(name: str, function: Any, in_specs: tuple, out_specs: Any, final_specs: Any = None) -> Any:
+        return layout.spread(function, in_specs, out_specs, jaxrl_vis_envs.jit, final_specs, **JIT_OPTIONS.get(name, {}))
 
     return TrainStep(
         env=env,
@@ -305,14 +305,14 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
             jax.vmap(learn, (_SEED_AXES, 0), Learned(_SEED_AXES, 0)),  # type: ignore[arg-type]
             (layout.loop, environments),
             Learned(layout.loop, seeds),  # type: ignore[arg-type]
-            kept_as=Learned(layout.loop, host),  # type: ignore[arg-type]
+            final_specs=Learned(layout.loop, host),  # type: ignore[arg-type]
         ),
         evaluate=spread(
             "evaluate",
             make_evaluate(acting, config.run.eval_episodes, shards),
             (seeds, replicated),
             Evaluation(seeds, environments),  # type: ignore[arg-type]
-            kept_as=Evaluation(host, host) if jax.process_count() > 1 else None,  # type: ignore[arg-type]
+            final_specs=Evaluation(host, host) if jax.process_count() > 1 else None,  # type: ignore[arg-type]
         ),
         pure_insert=insert,
         pure_update=iterations.make_update(config, sampler, algorithm),

@@ -72,7 +72,7 @@ def make_evaluate(acting: Acting, num_episodes: int, shards: Shards = ONE) -> Ca
         num_kept = num_recorded(num_episodes, shards)
         keys = jnp.broadcast_to(key, (jax.tree.leaves(train)[0].shape[0],))
         num_envs = num_episodes // shards.count
-        episodes, outcome, _ = play(acting, train, keys, num_envs, num_kept=num_kept, draws=shards)
+        episodes, outcome, _ = play(acting, train, keys, num_envs, num_kept=num_kept, random_source=shards)
         outcome_of_all = {name: shards.gather(values, axis=1) for name, values in outcome.items()}
         return summarize(outcome_of_all, episodes.observations, outcome["success"], acting.env.frame_stack)
 

@@ -16,7 +16,7 @@ from jaxrl_vis.learner.parallel.shards import ONE, Shards
 from jaxrl_vis.types import Episodes, Metrics, TrainState
 from jaxrl_vis_envs.base import GoalEnv, State
 
-Draws = Shards | RolloutPart
+RandomSource = Shards | RolloutPart
 """Source of random numbers for the environments of a call: all of a learner's, those of one device, or those of one part."""
 
 # Folded into keys for observation noise, so that it changes no other random numbers.
@@ -59,42 +59,42 @@ class Acting(NamedTuple):
     observe_state: Callable[[Any], jax.Array] | None = None
 
 
-def explore(action: jax.Array, exploration: Exploration, key: jax.Array, draws: Draws = ONE) -> jax.Array:
+def explore(action: jax.Array, exploration: Exploration, key: jax.Array, random_source: RandomSource = ONE) -> jax.Array:
     """Add exploration noise to actions, if there is any: [E, A] float32 in [-1, 1].
 
     Args:
         action: [E, A] float32 in [-1, 1], the policy's actions.
         exploration: Exploration noise.
         key: [] typed key for the noise.
-        draws: Source of random numbers for these environments.
+        random_source: Source of random numbers for these environments.
     """
     if exploration.is_none:
         return action
     noise_key, random_key = jax.random.split(key)
-    noise = draws.draw(lambda shape: jax.random.normal(noise_key, shape), action.shape)
+    noise = random_source.draw(lambda shape: jax.random.normal(noise_key, shape), action.shape)
     action = jnp.clip(action + exploration.action_noise * noise, -1.0, 1.0)
     # One sample determines both whether an action is random, and its value.
-    drawn = draws.draw(lambda shape: jax.random.uniform(random_key, shape), (*action.shape[:-1], 1 + action.shape[-1]))
+    drawn = random_source.draw(lambda shape: jax.random.uniform(random_key, shape), (*action.shape[:-1], 1 + action.shape[-1]))
     is_random = drawn[..., :1] < exploration.random_action_probability
     return jnp.where(is_random, 2.0 * drawn[..., 1:] - 1.0, action)
 
 
-def split_keys(keys: jax.Array, num_envs: int, draws: Draws = ONE) -> tuple[jax.Array, jax.Array]:
+def split_keys(keys: jax.Array, num_envs: int, random_source: RandomSource = ONE) -> tuple[jax.Array, jax.Array]:
     """Split the keys of a rollout [S] into keys of all resets [S * E], seed by seed, and keys of the policies [S]."""
     reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
-    return jax.vmap(lambda key: draws.split(key, num_envs))(reset_keys).reshape(-1), policy_keys
+    return jax.vmap(lambda key: random_source.split(key, num_envs))(reset_keys).reshape(-1), policy_keys
 
 
-def add_noise(key: jax.Array, observations: jax.Array, deviation: float, draws: Draws = ONE) -> jax.Array:
+def add_noise(key: jax.Array, observations: jax.Array, deviation: float, random_source: RandomSource = ONE) -> jax.Array:
     """Add camera noise to observations [E, ...]: same shape and dtype; bytes are rounded and clipped.
 
     Args:
         key: [] typed key.
         observations: uint8 images or float32 state vectors.
         deviation: Standard deviation of the noise, in the observation's unit.
-        draws: Source of random numbers for these environments.
+        random_source: Source of random numbers for these environments.
     """
-    noisy = observations + deviation * draws.noise(key, observations.shape)
+    noisy = observations + deviation * random_source.noise(key, observations.shape)
     if observations.dtype == jnp.uint8:
         noisy = jnp.clip(jnp.round(noisy), 0.0, 255.0)
     return noisy.astype(observations.dtype)
@@ -128,7 +128,7 @@ def play(
     exploration: Exploration = NO_EXPLORATION,
     num_kept: int | None = None,
     record: Callable[[State], Any] | None = None,
-    draws: Draws = ONE,
+    random_source: RandomSource = ONE,
 ) -> Rollout:
     """Roll out one episode in each of E environments, for each of S learners in parallel.
 
@@ -143,7 +143,7 @@ def play(
         num_kept: K, number of episodes to keep (the first ones); None for all.
         record: Function of the state of one environment that returns a pytree to record, after reset and after each step; None
             to record nothing.
-        draws: Source of random numbers for these environments.
+        random_source: Source of random numbers for these environments.
     """
     env, algorithm, deviation, observe_state = acting
     num_seeds = keys.shape[0]
@@ -159,14 +159,14 @@ def play(
         if not deviation:
             return observations
         noise_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
-        noisy = jax.vmap(lambda key, part: add_noise(key, part, deviation, draws))(noise_keys, by_seed(observations))
+        noisy = jax.vmap(lambda key, part: add_noise(key, part, deviation, random_source))(noise_keys, by_seed(observations))
         return noisy.reshape(observations.shape)
 
     def recorded(state: State) -> tuple[jax.Array | None, Any]:
         full_state = None if observe_state is None else jax.vmap(observe_state)(state.data)
         return jax.tree.map(stored, (full_state, None if record is None else jax.vmap(record)(state)))
 
-    reset_keys, policy_keys = split_keys(keys, num_envs, draws)
+    reset_keys, policy_keys = split_keys(keys, num_envs, random_source)
     state = jax.vmap(env.reset)(reset_keys)
     assert state.obs is not None
     first_observation = perturb(state.obs["observation"], policy_keys, _FIRST_NOISE)
@@ -176,7 +176,7 @@ def play(
     aims = jax.vmap(algorithm.aim)(policies, by_seed(goal))
 
     def act(policy: Any, aim: Any, key: jax.Array, observations: jax.Array) -> jax.Array:
-        return explore(algorithm.act(policy, observations, aim), exploration, key, draws)
+        return explore(algorithm.act(policy, observations, aim), exploration, key, random_source)
 
     def step(carry, step_keys):
         state, observation = carry

@@ -38,5 +38,5 @@ def make(spec: Spec) -> AuxTask:
         init=lambda key: heads.init_decoder(key, spec.latent_size, shape, spec.levels),
         predict=lambda params, view: from_blocks(decode(params, view), *size),
         loss=loss,
-        number=3,
+        key_index=3,
     )

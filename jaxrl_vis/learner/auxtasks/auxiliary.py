@@ -109,7 +109,7 @@ class Auxiliary:
         for name, task in self.tasks.items():
             transitions = Transitions(batch.observation_t, batch.observation_tp1, batch.action, stored.get(name))
             if task.view is not None:
-                views[name], targets[name] = task.view(key if task.draws_unfolded else task.fold(key), transitions)
+                views[name], targets[name] = task.view(key if task.uses_batch_key else task.fold(key), transitions)
             elif task.target is not None:
                 targets[name] = task.target(transitions)
         return batch.replace(views=views, targets=targets)

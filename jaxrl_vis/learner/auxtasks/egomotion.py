@@ -26,8 +26,8 @@ def make(spec: Spec) -> AuxTask:
         predict=predict,
         loss=lambda params, view: mean_squared_error(predict(params, view), read(view, "target")),
         view=lambda key, batch: egomotion_pair(key, batch.images_t, options.border, options.max_shift),
-        number=2,
-        draws_unfolded=True,
+        key_index=2,
+        uses_batch_key=True,
     )
 
 

@@ -28,5 +28,5 @@ def make(spec: Spec) -> AuxTask:
         init=lambda key: heads.init_linear(key, spec.latent_size + spec.action_size, spec.latent_size),
         predict=predict,
         loss=loss,
-        number=0,
+        key_index=0,
     )

@@ -19,5 +19,5 @@ def make(spec: Spec) -> AuxTask:
         init=lambda key: heads.init_linear(key, 2 * spec.latent_size, spec.action_size),
         predict=predict,
         loss=lambda params, view: mean_squared_error(predict(params, view), view.action),
-        number=1,
+        key_index=1,
     )

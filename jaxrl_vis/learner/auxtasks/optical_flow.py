@@ -42,7 +42,7 @@ def make(spec: Spec) -> AuxTask:
         episode=lambda images: to_bytes(flow_strength_along(images, spec.frame_stack, stretch), stretch),
         target=lambda batch: from_bytes(batch.stored, stretch),
         shift=lambda flow, pixels: shift_images(flow[:, None], pixels)[:, 0],
-        number=4,
+        key_index=4,
     )
 
 

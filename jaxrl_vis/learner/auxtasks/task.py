@@ -129,9 +129,9 @@ class AuxTask(NamedTuple):
         target: Transitions -> target, for tasks without ``view``; None if the loss needs no target.
         shift: (target, [B, 2] int32 pixels) -> target for images shifted by this down and to the right; None if the target does
             not change.
-        number: Integer (uint32) folded into the task's random keys, so that its samples do not depend on the other tasks; None
-            for a digest of the name.
-        draws_unfolded: Whether ``view`` uses the batch's own key, which only one task may do.
+        key_index: Integer (uint32) folded into the task's random keys, so that its samples do not depend on the other tasks;
+            None for a digest of the name.
+        uses_batch_key: Whether ``view`` uses the batch's own key, which only one task may do.
     """
 
     name: str
@@ -143,12 +143,12 @@ class AuxTask(NamedTuple):
     view: Callable[[jax.Array, Transitions], tuple[jax.Array, Any]] | None = None
     target: Callable[[Transitions], Any] | None = None
     shift: Callable[[Any, jax.Array], Any] | None = None
-    number: int | None = None
-    draws_unfolded: bool = False
+    key_index: int | None = None
+    uses_batch_key: bool = False
 
     def fold(self, key: jax.Array) -> jax.Array:
         """Derive the task's own key from a key that all tasks share, [] each."""
-        return jax.random.fold_in(key, zlib.crc32(self.name.encode()) if self.number is None else self.number)
+        return jax.random.fold_in(key, zlib.crc32(self.name.encode()) if self.key_index is None else self.key_index)
 
 
 def read(view: View, field: str) -> jax.Array:

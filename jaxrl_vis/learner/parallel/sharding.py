@@ -75,7 +75,7 @@ class Layout:
         return Spec(SEED, DATA)
 
     @property
-    def read_by_host(self) -> Spec:
+    def host_spec(self) -> Spec:
         """Spec of arrays [S, ...] for the host: replicated if other processes have some of the seeds."""
         return Spec() if jax.process_count() > 1 else Spec(SEED)
 
@@ -103,7 +103,7 @@ class Layout:
         return jax.tree.map(make_sharding, specs, is_leaf=lambda leaf: isinstance(leaf, Spec))
 
     def spread(
-        self, function: Callable, in_specs: tuple, out_specs: Any, jit: Callable, kept_as: Any = None, **options: Any
+        self, function: Callable, in_specs: tuple, out_specs: Any, jit: Callable, final_specs: Any = None, **options: Any
     ) -> Any:
         """Wrap a function of one device's part in `jax.shard_map` and ``jit``; on one device, in ``jit`` alone, without specs.
 
@@ -112,8 +112,8 @@ class Layout:
             in_specs: A partition spec, or a tree of them, for each argument.
             out_specs: Partition specs by which the devices' results are assembled, a spec or a tree of them.
             jit: Compiling transformation, such as `jax.jit`.
-            kept_as: Partition specs to which the assembled results are then resharded, such as `replicated` for the host; None
-                for ``out_specs``.
+            final_specs: Partition specs to which the assembled results are then resharded, such as `replicated` for the host;
+                None for ``out_specs``.
             **options: Further arguments of ``jit``.
 
         Returns:
@@ -123,7 +123,7 @@ class Layout:
             return jit(function, **options)
         # Kernels and custom rules do not declare along which axes their results vary, so JAX cannot check it.
         mapped = jax.shard_map(function, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
-        shardings = {"in_shardings": self.shardings(in_specs), "out_shardings": self.shardings(kept_as or out_specs)}
+        shardings = {"in_shardings": self.shardings(in_specs), "out_shardings": self.shardings(final_specs or out_specs)}
         return jit(mapped, **shardings, **options)
 
     def with_shardings(self, shapes: Any, specs: Any) -> Any:
