@@ -210,7 +210,7 @@ class Learner:
     def _act(self) -> Callable[..., jax.Array]:
         def act(train: TrainState, observations: jax.Array, goals: jax.Array) -> jax.Array:
             policy = self._algorithm.policy_params(train.agent, train.statistics)
-            return self._algorithm.act(policy, observations, self._algorithm.aim(policy, goals))
+            return self._algorithm.act(policy, observations, self._algorithm.encode_goal(policy, goals))
 
         return jax.jit(act)
 

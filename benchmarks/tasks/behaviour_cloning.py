@@ -50,4 +50,4 @@ def make(setup: Setup) -> Algorithm:
     def policy_params(agent: AgentState, statistics: Statistics) -> Any:
         return policy.params(agent.actor, statistics)
 
-    return Algorithm(init, policy.act, scan_batches(step), policy_params, policy.aim)
+    return Algorithm(init, policy.act, scan_batches(step), policy_params, policy.encode_goal)

@@ -4,12 +4,12 @@
     update          all gradient steps of an iteration, on batches sampled from the replay
     policy_params   the part of an agent needed for acting: small, and sufficient for a policy
     act             actions without exploration
-    aim             representation of the goals that ``act`` takes, computed once per episode
+    encode_goal     representation of the goals that ``act`` takes, computed once per episode
     diagnose        further metrics of a rollout
 
 An algorithm is built by a function of a `Setup`, which holds the configuration and the sizes of the task. DDPG, TD3 and
 contrastive RL are built in (`train_step.ALGORITHMS`); ``--algorithm module:Name`` selects a custom one. `networks.policy`
-provides ``act``, ``aim`` and ``policy_params`` for algorithms whose actor is that of the shared networks.
+provides ``act``, ``encode_goal`` and ``policy_params`` for algorithms whose actor is that of the shared networks.
 """
 
 import dataclasses
@@ -74,11 +74,11 @@ class Algorithm(NamedTuple):
 
     Attributes:
         init: key -> agent.
-        act: (policy parameters, observations [E, ...], aim) -> actions [E, A] float32 in [-1, 1].
+        act: (policy parameters, observations [E, ...], encoded goals) -> actions [E, A] float32 in [-1, 1].
         update: (agent, Statistics, Batches, key) -> (agent after a gradient step on every batch, means of metrics, [] float32
             by name).
-        policy_params: (agent, Statistics) -> parameters that ``act`` and ``aim`` read.
-        aim: (policy parameters, goals [E, ...]) -> tree of arrays [E, ...], the representation of goals that ``act`` takes.
+        policy_params: (agent, Statistics) -> parameters that ``act`` and ``encode_goal`` read.
+        encode_goal: (policy parameters, goals [E, ...]) -> tree of arrays [E, ...], encoded goals as ``act`` takes them.
             Goals are constant, so it is computed once per episode. By default the goals themselves.
         diagnose: (agent, Statistics, goals [E, ...] of a rollout) -> further metrics, [] float32 by name, averaged over the
             shards of a learner.
@@ -89,7 +89,7 @@ class Algorithm(NamedTuple):
     act: Callable[[PolicyParams, jax.Array, Any], jax.Array]
     update: Update
     policy_params: Callable[[Agent, Statistics], PolicyParams]
-    aim: Callable[[PolicyParams, jax.Array], Any] = lambda params, goals: goals
+    encode_goal: Callable[[PolicyParams, jax.Array], Any] = lambda params, goals: goals
     diagnose: Callable[[Agent, Statistics, jax.Array], Metrics] = lambda agent, statistics, goals: {}
     networks: Any = None
 
@@ -108,7 +108,7 @@ class Algorithm(NamedTuple):
             act=self.act,
             update=update,
             policy_params=lambda agent, _: agent,
-            aim=self.aim,
+            encode_goal=self.encode_goal,
             networks=self.networks,
         )
 

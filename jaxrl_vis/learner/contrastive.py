@@ -163,7 +163,7 @@ def build(setup: Setup, loss: Callable[[jax.Array], jax.Array], stabilised: bool
     def policy_params(agent: Agent, statistics: Statistics) -> PolicyParams:
         return policy.params(networks.with_encoder(agent.actor, agent.critic), statistics)
 
-    return Algorithm(init, policy.act, scan_batches(step), policy_params, policy.aim, networks=networks)
+    return Algorithm(init, policy.act, scan_batches(step), policy_params, policy.encode_goal, networks=networks)
 
 
 def _with_other_goals(latents: jax.Array) -> jax.Array:

@@ -203,7 +203,7 @@ def test_exploration_has_its_shares_and_spread():
         def act(key, train):
             algorithm = program.algorithm
             policy = algorithm.policy_params(train.agent, train.statistics)
-            action = algorithm.act(policy, observations, algorithm.aim(policy, observations))
+            action = algorithm.act(policy, observations, algorithm.encode_goal(policy, observations))
             return rollout.explore(action, exploration, key)
 
         return np.asarray(act(jax.random.key(5), train))[:, 0]

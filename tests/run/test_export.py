@@ -138,7 +138,7 @@ def made(name: str, **changes: Any) -> tuple[Any, ...]:
     policy = make_policy(networks)
     params = policy.params(actor, Statistics(statistics(), own_goals))
     inputs = [random.uniform(0, 256, (5, *shape)).astype(dtype) for _ in range(2)]
-    expected = np.asarray(policy.act(params, inputs[0], policy.aim(params, inputs[1])))
+    expected = np.asarray(policy.act(params, inputs[0], policy.encode_goal(params, inputs[1])))
     assert np.ptp(expected) > 1e-2
     return collect(networks, params), shape, dtype, inputs, expected
 

@@ -218,7 +218,7 @@ def test_a_recorded_episode_is_whole_and_never_written_over(
 
 def test_a_task_of_states_has_a_page_without_images(policy: Policy, tmp_path: Path) -> None:
     env = point_mass.StatePointMass(point_mass.PointMassConfig())
-    algorithm = policy.algorithm._replace(act=lambda *_: jnp.ones((1, 2)), aim=lambda params, goals: goals)
+    algorithm = policy.algorithm._replace(act=lambda *_: jnp.ones((1, 2)), encode_goal=lambda params, goals: goals)
     session, server = live.Session(dataclasses.replace(policy, env=env, algorithm=algorithm)), Server()
     page = live.Page(server, session, "ball", tmp_path / "seen.gif")
     page.advance()

@@ -173,14 +173,14 @@ def play(
     goal = perturb(state.obs["desired_goal"], policy_keys, _GOAL_NOISE)
     first_state, first_records = state.achieved_state, recorded(state)
     policies = jax.vmap(algorithm.policy_params)(train.agent, train.statistics)
-    aims = jax.vmap(algorithm.aim)(policies, by_seed(goal))
+    encoded_goals = jax.vmap(algorithm.encode_goal)(policies, by_seed(goal))
 
-    def act(policy: Any, aim: Any, key: jax.Array, observations: jax.Array) -> jax.Array:
-        return explore(algorithm.act(policy, observations, aim), exploration, key, random_source)
+    def act(policy: Any, encoded_goal: Any, key: jax.Array, observations: jax.Array) -> jax.Array:
+        return explore(algorithm.act(policy, observations, encoded_goal), exploration, key, random_source)
 
     def step(carry, step_keys):
         state, observation = carry
-        action = jax.vmap(act)(policies, aims, step_keys, by_seed(observation)).reshape(num_seeds * num_envs, -1)
+        action = jax.vmap(act)(policies, encoded_goals, step_keys, by_seed(observation)).reshape(num_seeds * num_envs, -1)
         state = jax.vmap(env.advance)(state, action)
         observation = perturb(jax.vmap(env.observe)(state), step_keys, _STEP_NOISE)
         step_results = tuple(stored(leaf) for leaf in (observation, state.achieved_state, action))

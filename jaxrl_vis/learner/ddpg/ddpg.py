@@ -358,7 +358,7 @@ def build(setup: Setup, critic_heads: int = 1, draw_noise: DrawNoise | None = No
         return policy.params(networks.with_encoder(agent.actor, agent.critic), statistics)
 
     update = make_update(config, steps, draw_noise)
-    algorithm = Algorithm(steps.init, policy.act, update, policy_params, policy.aim, networks=networks)
+    algorithm = Algorithm(steps.init, policy.act, update, policy_params, policy.encode_goal, networks=networks)
     if setup.critic_state_size:  # true states at goal images are unknown
         return algorithm
     return algorithm._replace(diagnose=functools.partial(_value_at_goals, networks))

@@ -1,6 +1,6 @@
 """Deterministic policy of the shared networks: an actor, and the statistics that normalise its observations.
 
-Implements `Algorithm.act`, ``aim`` and ``policy_params`` for any algorithm whose actor is that of `Networks`.
+Implements `Algorithm.act`, ``encode_goal`` and ``policy_params`` for any algorithm whose actor is that of `Networks`.
 """
 
 from collections.abc import Callable
@@ -31,12 +31,12 @@ class Policy(NamedTuple):
 
     Attributes:
         params: (actor parameters with an encoder, Statistics) -> PolicyParams.
-        aim: (PolicyParams, goals [E, ...]) -> latents [E, latent], computed once per episode.
+        encode_goal: (PolicyParams, goals [E, ...]) -> latents [E, latent], computed once per episode.
         act: (PolicyParams, observations [E, ...], latents of the goals [E, latent]) -> actions [E, A] float32 in [-1, 1].
     """
 
     params: Callable[[Params, Statistics], PolicyParams]
-    aim: Callable[[PolicyParams, jax.Array], jax.Array]
+    encode_goal: Callable[[PolicyParams, jax.Array], jax.Array]
     act: Callable[[PolicyParams, jax.Array, jax.Array], jax.Array]
 
 
@@ -46,11 +46,11 @@ def make_policy(networks: Networks) -> Policy:
     def encode(policy: PolicyParams, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
         return networks.encode(policy.actor, networks.prepare(networks.scaling(statistics), observations))
 
-    def act(policy: PolicyParams, observations: jax.Array, aim: jax.Array) -> jax.Array:
-        return networks.act(policy.actor, jnp.stack([encode(policy, policy.observations, observations), aim]))
+    def act(policy: PolicyParams, observations: jax.Array, encoded_goal: jax.Array) -> jax.Array:
+        return networks.act(policy.actor, jnp.stack([encode(policy, policy.observations, observations), encoded_goal]))
 
     return Policy(
         params=lambda actor, statistics: PolicyParams(actor, statistics.observations, statistics.goals),
-        aim=lambda policy, goals: encode(policy, policy.goals, goals),
+        encode_goal=lambda policy, goals: encode(policy, policy.goals, goals),
         act=act,
     )

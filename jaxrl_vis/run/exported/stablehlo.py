@@ -25,7 +25,7 @@ def to_bytes(policy: Policy) -> bytes:
 
     def act(observation: jax.Array, goal: jax.Array) -> jax.Array:
         with jax.default_matmul_precision("highest"):
-            return algorithm.act(parameters, observation, algorithm.aim(parameters, goal))
+            return algorithm.act(parameters, observation, algorithm.encode_goal(parameters, goal))
 
     (batch,) = export.symbolic_shape("batch")
     spec = jax.ShapeDtypeStruct((batch, *policy.observation_spec.shape), policy.observation_spec.dtype)

@@ -74,8 +74,8 @@ class Session:
             return env.observe(env.state_at(data, achieved)), achieved
 
         def step(parameters: Any, state: Any, observation: jax.Array, goal: jax.Array) -> tuple[Any, jax.Array]:
-            act, aim = policy.algorithm.act, policy.algorithm.aim
-            state = env.advance(state, act(parameters, observation[None], aim(parameters, goal[None]))[0])
+            act, encode_goal = policy.algorithm.act, policy.algorithm.encode_goal
+            state = env.advance(state, act(parameters, observation[None], encode_goal(parameters, goal[None]))[0])
             return state, env.observe(state)
 
         self._begin, self._look, self._step, self._configure_goal = map(

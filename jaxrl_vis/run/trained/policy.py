@@ -36,7 +36,7 @@ class Policy:
         seed: Seed of the run that trained it.
         iteration: Iteration of its checkpoint.
         parameters: Parameters of the policy, from `Algorithm.policy_params`.
-        algorithm: The algorithm, whose ``act`` and ``aim`` read them.
+        algorithm: The algorithm, whose ``act`` and ``encode_goal`` read them.
     """
 
     env: GoalEnv
@@ -84,7 +84,7 @@ class Policy:
 
         def act(parameters: PolicyParams, observation: jax.Array, goal: jax.Array) -> jax.Array:
             observations, goals = (jnp.asarray(array, self.observation_spec.dtype)[None] for array in (observation, goal))
-            return algorithm.act(parameters, observations, algorithm.aim(parameters, goals))[0]
+            return algorithm.act(parameters, observations, algorithm.encode_goal(parameters, goals))[0]
 
         return jax.jit(act)
 
