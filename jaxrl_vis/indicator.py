@@ -21,7 +21,7 @@ import numpy as np
 
 from jaxrl_vis.config import Config, preset, validate
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.host.plugins import call, find
+from jaxrl_vis.host.plugins import build_component, find_component
 from jaxrl_vis.learner import train_step
 from jaxrl_vis.learner.algorithm import Algorithm, Setup
 from jaxrl_vis.learner.auxtasks.auxiliary import make_auxiliary
@@ -114,8 +114,8 @@ class Learner:
             raise RequestError("a learner on the host has no auxiliary losses: leave out aux_tasks")
         setup = Setup(self.config, resolved, self._spec, action_size, auxiliary)
         algorithm = self.config.run.algorithm
-        maker = find("algorithm", algorithm, train_step.ALGORITHMS, self.config.environment.env_folder)
-        self._algorithm = call("algorithm", algorithm, maker, setup, of=Algorithm)
+        maker = find_component("algorithm", algorithm, train_step.ALGORITHMS, self.config.environment.env_folder)
+        self._algorithm = build_component("algorithm", algorithm, maker, setup, expected_type=Algorithm)
         self._replay = Replay(capacity, 1, horizon)
         self._sampler = Sampler(self.config, resolved, self._replay, threshold)
         self._key = jax.random.key(self.config.run.seed)

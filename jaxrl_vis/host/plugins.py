@@ -28,7 +28,7 @@ def custom_names(config: Config) -> dict[str, str]:
     return {kind: name for kind, name in names.items() if task_modules.is_custom(name)}
 
 
-def find(kind: str, name: str, known: Mapping[str, T], folder: str | None = None) -> T | Any:
+def find_component(kind: str, name: str, known: Mapping[str, T], folder: str | None = None) -> T | Any:
     """Return a component by name; a ``module:Name`` is imported.
 
     Args:
@@ -52,7 +52,7 @@ def find(kind: str, name: str, known: Mapping[str, T], folder: str | None = None
 
 
 def load(name: str, folder: str | None = None) -> tuple[ModuleType, str]:
-    """Import the module of ``module:Name``; return it and ``Name``. For ``folder`` see `find`.
+    """Import the module of ``module:Name``; return it and ``Name``. For ``folder`` see `find_component`.
 
     Raises:
         RequestError: ``name`` does not have this form, or the module cannot be imported.
@@ -64,22 +64,22 @@ def load(name: str, folder: str | None = None) -> tuple[ModuleType, str]:
         raise RequestError(str(error)) from error
 
 
-def call(kind: str, name: str, maker: Any, *arguments: Any, of: type) -> Any:
+def build_component(kind: str, name: str, maker: Any, *arguments: Any, expected_type: type) -> Any:
     """Call the function that builds a component, and return its result after checking the type.
 
     Args:
-        kind, name: As in `find`, for messages.
+        kind, name: As in `find_component`, for messages.
         maker: The function, or the component itself, which is returned as it is.
         arguments: Arguments of the function.
-        of: Class of the component.
+        expected_type: Class of the component.
 
     Raises:
         RequestError: The function fails, or returns another type.
     """
-    if isinstance(maker, of):
+    if isinstance(maker, expected_type):
         return maker
     if not callable(maker):
-        raise RequestError(f"{name} is no {kind}: it must be a function that returns a {of.__name__}, not {maker!r}")
+        raise RequestError(f"{name} is no {kind}: it must be a function that returns a {expected_type.__name__}, not {maker!r}")
     try:
         made = maker(*arguments)
     except RequestError:
@@ -87,6 +87,6 @@ def call(kind: str, name: str, maker: Any, *arguments: Any, of: type) -> Any:
     except Exception as error:  # noqa: BLE001 - somebody else's code may raise anything
         file = getattr(getattr(maker, "__code__", None), "co_filename", None)
         raise RequestError(f"{kind} {name} cannot be made: {task_modules.describe_error(error, file)}") from error
-    if not isinstance(made, of):
-        raise RequestError(f"{name} is no {kind}: it returned a {type(made).__name__}, not a {of.__name__}")
+    if not isinstance(made, expected_type):
+        raise RequestError(f"{name} is no {kind}: it returned a {type(made).__name__}, not a {expected_type.__name__}")
     return made

@@ -6,7 +6,7 @@ import math
 from jaxrl_vis.config.groups import Config
 from jaxrl_vis.config.methods import METHODS, Method
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.host.plugins import call, find
+from jaxrl_vis.host.plugins import build_component, find_component
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,8 +49,8 @@ def resolve(config: Config, horizon: int) -> Resolved:
         RequestError: The method is unknown, the discount or the filter threshold is out of range, a threshold is set for a
             method that does not filter, or R+ is not larger than R-.
     """
-    method = find("method", config.reward.method, METHODS, config.environment.env_folder)
-    method = call("method", config.reward.method, method, of=Method)
+    method = find_component("method", config.reward.method, METHODS, config.environment.env_folder)
+    method = build_component("method", config.reward.method, method, expected_type=Method)
     discount = 1.0 - 1.0 / horizon if config.ddpg.discount is None else config.ddpg.discount
     if not 0.0 <= discount < 1.0:
         raise RequestError(f"discount must lie in [0, 1), not {discount}; leave it out for 1 - 1/horizon")

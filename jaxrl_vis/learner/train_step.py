@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import jaxrl_vis_envs
 from jaxrl_vis.config import Config, validate
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.host.plugins import call, find
+from jaxrl_vis.host.plugins import build_component, find_component
 from jaxrl_vis.learner import contrastive, td3
 from jaxrl_vis.learner import iteration as iterations
 from jaxrl_vis.learner.acting.evaluate import Evaluation, make_evaluate
@@ -233,8 +233,8 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
     full_state_size = _full_state_size(env, config)
     critic_state_size = full_state_size + env.goal_state_size if full_state_size else 0
     setup = Setup(config, resolved, env.observation_spec, env.action_size, auxiliary, shards, critic_state_size)
-    maker = find("algorithm", config.run.algorithm, ALGORITHMS, config.environment.env_folder)
-    algorithm = call("algorithm", config.run.algorithm, maker, setup, of=Algorithm)
+    maker = find_component("algorithm", config.run.algorithm, ALGORITHMS, config.environment.env_folder)
+    algorithm = build_component("algorithm", config.run.algorithm, maker, setup, expected_type=Algorithm)
     statistics = normalizer.init(env.observation_spec)
     unseen = Statistics(
         statistics,

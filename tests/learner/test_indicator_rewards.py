@@ -113,7 +113,10 @@ def test_stacked_images_are_compared_as_goals():
         scaling = networks.batch_scaling(train.statistics)
         inputs = networks.prepare_batch(scaling, batch)
         both = batch.replace(reached=reached), batch
-        return [learned_reward.of_batch(train.agent.reward_model, scaling.observations, inputs, each).reward for each in both]
+        return [
+            learned_reward.compute_batch_rewards(train.agent.reward_model, scaling.observations, inputs, each).reward
+            for each in both
+        ]
 
     of_reached, of_moving = rewards(train, batch)
     np.testing.assert_allclose(of_reached, 1.0, atol=1e-5)

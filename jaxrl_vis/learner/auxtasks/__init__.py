@@ -13,7 +13,7 @@ samples what the tasks of a run declare, without referring to any task by name.
 from collections.abc import Callable, Sequence
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.host.plugins import call, find
+from jaxrl_vis.host.plugins import build_component, find_component
 from jaxrl_vis.learner.auxtasks import autoencoder, egomotion, forward_dynamics, inverse_dynamics, optical_flow
 from jaxrl_vis.learner.auxtasks.task import RELEASE, AuxTask, Options, Spec, Transitions, View
 
@@ -43,7 +43,7 @@ def make(names: Sequence[str], spec: Spec, folder: str | None = None) -> dict[st
         RequestError: A name is unknown or occurs twice, a function does not return an `AuxTask`, two tasks have the same
             `AuxTask.name`, or observations are not images.
     """
-    makers = [find("auxiliary task", name, _MAKERS, folder) for name in names]
+    makers = [find_component("auxiliary task", name, _MAKERS, folder) for name in names]
     for name in names:
         if names.count(name) > 1:
             raise RequestError(f"auxiliary task {name} is given twice; give it once")
@@ -53,7 +53,7 @@ def make(names: Sequence[str], spec: Spec, folder: str | None = None) -> dict[st
             f"auxiliary tasks ({', '.join(names)}) train an encoder of images, and here observations are states of "
             f"{shape[0]} numbers: choose a task that shows images (its name begins with Visual), or no auxiliary tasks"
         )
-    built = [call("auxiliary task", name, maker, spec, of=AuxTask) for name, maker in zip(names, makers)]
+    built = [build_component("auxiliary task", name, maker, spec, expected_type=AuxTask) for name, maker in zip(names, makers)]
     tasks = {task.name: task for task in built}
     if len(tasks) < len(built):
         raise RequestError(f"two auxiliary tasks call themselves alike ({', '.join(task.name for task in built)}): rename one")

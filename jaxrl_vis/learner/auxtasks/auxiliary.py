@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxrl_vis.config import Config
 from jaxrl_vis.config.methods import LOG_WEIGHTINGS
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.host.plugins import call, find
+from jaxrl_vis.host.plugins import build_component, find_component
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxtasks import AuxTask, Spec, Transitions, View
 from jaxrl_vis.types import Batch, Episodes, Params
@@ -209,8 +209,8 @@ def make_auxiliary(
     if config.auxiliary.weighting in WEIGHTINGS:
         weighting = _limit_weights(config, make_weighting(config.auxiliary.weighting, **_options(config)))
     else:
-        maker = find("weighting", config.auxiliary.weighting, WEIGHTINGS, config.environment.env_folder)
-        weighting = call("weighting", config.auxiliary.weighting, maker, of=Weighting)
+        maker = find_component("weighting", config.auxiliary.weighting, WEIGHTINGS, config.environment.env_folder)
+        weighting = build_component("weighting", config.auxiliary.weighting, maker, expected_type=Weighting)
     if config.study.weighting_cosines:
         if not config.auxiliary.aux_tasks:
             raise RequestError("weighting_cosines compares auxiliary losses, and there are none: add --aux-tasks")

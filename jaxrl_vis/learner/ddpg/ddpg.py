@@ -240,7 +240,9 @@ def make_ddpg(
         copies = ComputeCopies(*map(networks.with_compute_copy, _network_parameters(agent), working.copies))
         rewarded = None
         if learned_reward is not None:
-            rewarded = learned_reward.of_batch(agent.reward_model, working.scaling.observations, prepared.inputs, batch)
+            rewarded = learned_reward.compute_batch_rewards(
+                agent.reward_model, working.scaling.observations, prepared.inputs, batch
+            )
         if rewarded is not None:
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None

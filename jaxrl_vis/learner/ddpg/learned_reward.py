@@ -42,7 +42,7 @@ class ModelState(Replaceable):
 
 
 class BatchRewards(NamedTuple):
-    """Result of `LearnedReward.of_batch`.
+    """Result of `LearnedReward.compute_batch_rewards`.
 
     Attributes:
         reward: [B] float32, without gradient.
@@ -93,7 +93,7 @@ class LearnedReward:
         params = self.init_params(key)
         return ModelState(params=params, optimizer=self.optimizer.init(params))
 
-    def of_batch(self, state: ModelState, scaling: Scaling, inputs: Inputs, batch: Batch) -> BatchRewards:
+    def compute_batch_rewards(self, state: ModelState, scaling: Scaling, inputs: Inputs, batch: Batch) -> BatchRewards:
         """Compute the rewards of a batch, and the model's gradient.
 
         Args:

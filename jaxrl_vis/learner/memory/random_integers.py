@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 
-def to_integers(fraction: jax.Array, count: int | jax.Array) -> jax.Array:
+def fractions_to_integers(fraction: jax.Array, count: int | jax.Array) -> jax.Array:
     """Scale fractions to integers from 0 to ``count`` - 1, uniform up to the fractions' resolution: [...] int32.
 
     Args:

@@ -14,7 +14,7 @@ For the transition from slot t to t+1, with probability
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.learner.memory.random_integers import to_integers
+from jaxrl_vis.learner.memory.random_integers import fractions_to_integers
 
 
 def geometric_offsets(fraction: jax.Array, remaining: jax.Array, discount: float) -> jax.Array:
@@ -51,7 +51,7 @@ def choose_goal_slots(
     """
     strategy, fraction = jax.random.uniform(key, (2, *time.shape))
     remaining = horizon - time
-    later = to_integers(fraction, remaining) if discount is None else geometric_offsets(fraction, remaining, discount)
+    later = fractions_to_integers(fraction, remaining) if discount is None else geometric_offsets(fraction, remaining, discount)
     future = time + 1 + later
     slots = jnp.where(strategy < relabel_probability, future, horizon + 1)
     return jnp.where(strategy < relabel_probability * balance_probability, time + 1, slots).astype(jnp.int32)

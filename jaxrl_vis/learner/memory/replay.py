@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.learner.memory.random_integers import to_integers
+from jaxrl_vis.learner.memory.random_integers import fractions_to_integers
 from jaxrl_vis.types import Batch, Episodes, ReplayState
 
 _WORD = 4  # bytes
@@ -179,8 +179,8 @@ class Replay(NamedTuple):
         if self.mean_age is not None:  # an exponential distribution that ends with the oldest episode
             mean = self.mean_age * self.num_envs
             of_episode = -mean * jnp.log1p(of_episode * jnp.expm1(-size / mean)) / size
-        age = to_integers(of_episode, size)
-        return Indices(episode=(latest - age) % self.num_episodes, time=to_integers(of_time, self.horizon))
+        age = fractions_to_integers(of_episode, size)
+        return Indices(episode=(latest - age) % self.num_episodes, time=fractions_to_integers(of_time, self.horizon))
 
     def gather(
         self,

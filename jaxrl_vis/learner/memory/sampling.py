@@ -18,7 +18,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.config.methods import RewardFunction
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.memory import reward_errors
-from jaxrl_vis.learner.memory.random_integers import to_integers
+from jaxrl_vis.learner.memory.random_integers import fractions_to_integers
 from jaxrl_vis.learner.memory.relabel import choose_goal_slots
 from jaxrl_vis.learner.memory.replay import Indices, Replay
 from jaxrl_vis.learner.memory.rewards import make_reward
@@ -96,7 +96,7 @@ class Sampler:
         if self.config.network.random_shift:
             max_shift, shape = self.config.network.random_shift, (self.config.run.batch_size, 2)
             fraction = jax.random.uniform(jax.random.fold_in(key, _SHIFT), shape)
-            choice = choice._replace(shift=to_integers(fraction, 2 * max_shift + 1) - max_shift)
+            choice = choice._replace(shift=fractions_to_integers(fraction, 2 * max_shift + 1) - max_shift)
         if self.config.study.reward_clutter < 1.0:
             choice = choice._replace(clutter_end=self._clutter_end(state, iteration))
         parted = jax.tree.map(self.shards.part, choice._replace(clutter_end=None))

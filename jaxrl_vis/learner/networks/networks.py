@@ -296,25 +296,25 @@ class Networks:
         limit = self.config.network.normalizer_clip
         return jnp.clip((observations.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
 
-    def encode(self, params: Params, inputs: jax.Array, which: slice = slice(None)) -> jax.Array:
+    def encode(self, params: Params, inputs: jax.Array, selection: slice = slice(None)) -> jax.Array:
         """Encode prepared observations: [B, latent]; a state vector is its own latent.
 
         Args:
             params: Parameters of the actor or critic; only ``encoder`` is read.
             inputs: Observations from `prepare`.
-            which: Slice of their first axis that is encoded, of length B.
+            selection: Slice of their first axis that is encoded, of length B.
         """
-        return self.encode_pieces(params, [(inputs, which)])
+        return self.encode_pieces(params, [(inputs, selection)])
 
     def encode_pieces(self, params: Params, pieces: Sequence[Piece]) -> jax.Array:
         """Encode slices of several arrays of prepared observations; concatenate the latents: [B, latent]."""
         if not self.sees_images:
-            return jnp.concatenate([inputs[which] for inputs, which in pieces])
+            return jnp.concatenate([inputs[selection] for inputs, selection in pieces])
         if not self.uses_kernel:
-            return self._encoder.apply({"params": params["encoder"]}, *(inputs[which] for inputs, which in pieces))
+            return self._encoder.apply({"params": params["encoder"]}, *(inputs[selection] for inputs, selection in pieces))
         channels = self.observation_spec.shape[0]
         weights = encoder_kernel.make_weights(params["encoder"], channels)
-        features = [encoder_kernel.encode(inputs, weights, which) for inputs, which in pieces]
+        features = [encoder_kernel.encode(inputs, weights, selection) for inputs, selection in pieces]
         finer = 4 ** (self._levels - encoder_kernel.LEVELS)
         blocks = [part.reshape(part.shape[0], part.shape[1] // finer, finer * part.shape[2]) for part in features]
         return self._encoder.apply({"params": params["encoder"]}, *blocks, first_layer=encoder_kernel.LEVELS)

@@ -54,7 +54,8 @@ def _reward_of_run(run_dir: Path, trust: bool) -> Reward:
             raise RequestError(f"the run in {run_dir} sees images of {shape}, and these are of {images.shape[1:]}: audit those")
         batch = _make_batch(images, goals)
         inputs = networks.prepare_batch(scaling, batch)
-        return (model.of_batch(train.agent.reward_model, scaling.observations, inputs, batch).reward - low) / (high - low)
+        rewards = model.compute_batch_rewards(train.agent.reward_model, scaling.observations, inputs, batch).reward
+        return (rewards - low) / (high - low)
 
     return reward
 
@@ -78,7 +79,7 @@ def find_reward(name: str, config: Config, trust: bool = False) -> Reward:
     if ":" not in name:
         others = "run folders and module:function are rewards, too"
         raise RequestError(f"unknown reward {name!r}{nearest(name, BUILT_IN)} ({others})")
-    plugin: Any = plugins.find("reward", name, {}, config.environment.env_folder)
+    plugin: Any = plugins.find_component("reward", name, {}, config.environment.env_folder)
     if not callable(plugin):
         raise RequestError(f"{name} is no reward: it must be a function of images and goal images")
     own: Any = plugin

@@ -91,17 +91,17 @@ def prepare(
 # -- Images to features
 
 
-def encode(patches: jax.Array, weights: Weights, which: slice = slice(None), interpret: bool = False) -> jax.Array:
-    """Encode the images ``which`` by `apply`: [B, patches, 64 C'] -> [images, patches, F], same dtype; ``interpret`` as there.
+def encode(patches: jax.Array, weights: Weights, selection: slice = slice(None), interpret: bool = False) -> jax.Array:
+    """Encode the selected images by `apply`: [B, patches, 64 C'] -> [images, patches, F], same dtype; ``interpret`` as there.
 
     Images are selected here rather than sliced beforehand, because passing a slice to a kernel would copy it.
     """
     batch, of_image, size = patches.shape
-    images = range(batch)[which]
+    images = range(batch)[selection]
     first, count = images.start * of_image, len(images) * of_image
     rows = count
     if math.gcd(first, count) % TILE:  # a few small images
-        patches = jnp.pad(patches[which], ((0, -len(images) % TILE), (0, 0), (0, 0)))
+        patches = jnp.pad(patches[selection], ((0, -len(images) % TILE), (0, 0), (0, 0)))
         first, rows = 0, patches.shape[0] * of_image
     chosen = apply_forwards if forward_mode.is_active() else apply
     out: jax.Array = chosen(patches.reshape(-1, size), weights, first, rows, interpret)  # type: ignore[assignment]
