@@ -97,6 +97,6 @@ def registered(programs_folder: Path | None = None) -> Iterator[None]:
         patch.setitem(registry._ENTRIES, "VisualPoint", registry._Entry(PointMass, PointMassConfig))
         if programs_folder is not None:
             patch.setattr(PointMass, "__module__", "jaxrl_vis_envs.tasks.point_mass")
-            patch.setenv(trace_cache.VARIABLE, "1")
+            patch.setenv(trace_cache.CACHE_VARIABLE, "1")
             patch.setattr(programs, "enable_compilation_cache", lambda: str(programs_folder))
         yield

@@ -26,7 +26,7 @@ from benchmarks.peers import command
 from benchmarks.peers.image_comparison import MAX_DIFFERENCE, Comparison, measure_beside_ours, textured_geoms
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.timing import measure as measure_time
-from jaxrl_vis.bench.variation import alternate, assert_new_images
+from jaxrl_vis.bench.variation import assert_new_images, cycle_batches
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.render import Scene
 
@@ -87,7 +87,7 @@ def measure(comparison: Comparison) -> Measurement:
     labels = marks[0][..., 0].astype(np.int32).reshape(-1, size, size) if marks else None
     max_difference = MAX_LIT_DIFFERENCE if comparison.scene.hierarchies is not None else MAX_DIFFERENCE
     agreement = comparison.agreement(colours, depth, MAX_TEXTURED_DIFFERENCE, max_difference, labels)
-    timing = measure_time(alternate(lambda draw: draw(), draws), comparison.repeats, wait=lambda _: wp.synchronize_device())
+    timing = measure_time(cycle_batches(lambda draw: draw(), draws), comparison.repeats, wait=lambda _: wp.synchronize_device())
     value = comparison.config["images"] / timing.median_s
     return Measurement(
         name="render/peer_warp",

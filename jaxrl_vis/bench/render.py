@@ -16,7 +16,7 @@ from jaxrl_vis.bench.scenes import images as scene_images
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
-from jaxrl_vis.bench.variation import alternate, assert_new_images
+from jaxrl_vis.bench.variation import assert_new_images, cycle_batches
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs import registry
 
@@ -49,7 +49,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
                 drawn = [jax.tree.map(lambda leaf, count=count: leaf[:count], states) for states in batches]
                 compiled, compile_s = compile_timed(jaxrl_vis_envs.jit(jax.vmap(env.observe)), drawn[0])
                 assert_new_images(compiled, drawn)
-                timing = measure_time(alternate(compiled, drawn), settings.repeats)
+                timing = measure_time(cycle_batches(compiled, drawn), settings.repeats)
                 yield Measurement(
                     name="render/images",
                     value=count / timing.median_s,

@@ -24,7 +24,7 @@ def assert_varied(rows: Any, label: str) -> None:
         raise AssertionError(f"only {distinct} of {count} {label} differ: this would measure a broadcast")
 
 
-def alternate(draw: Callable[[Any], Any], batches: list[Any]) -> Callable[[], Any]:
+def cycle_batches(draw: Callable[[Any], Any], batches: list[Any]) -> Callable[[], Any]:
     """Return a function without arguments that renders the batches in turn."""
     turns = itertools.cycle(batches)
     return lambda: draw(next(turns))

@@ -27,7 +27,7 @@ import numpy as np
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError
 from jaxrl_vis.host import distributed
 from jaxrl_vis.host.streams import reserve_standard_files, safe_streams
-from jaxrl_vis.run import earlier, trust
+from jaxrl_vis.run import resume_checks, trust
 from jaxrl_vis.run.compiled.memory import check_compiled, check_memory, fit_together
 from jaxrl_vis.run.compiled.pending import PendingMetrics
 from jaxrl_vis.run.compiled.programs import Programs
@@ -117,10 +117,12 @@ class RunLoop:
         if is_resumed:
             self._checkpoints.run_id = read_run_id(self._folder.path)
         with run_lock(self._folder.path, self._echo) if self._writes else contextlib.nullcontext() as self._lock, self._console:
-            if is_resumed and earlier.is_finished(self._folder, self._checkpoints, self._programs, self._total, self._echo):
-                if self._writes and (note := earlier.truncate_metrics(self._folder, self._checkpoints, sys.maxsize)):
+            if is_resumed and resume_checks.is_finished(
+                self._folder, self._checkpoints, self._programs, self._total, self._echo
+            ):
+                if self._writes and (note := resume_checks.truncate_metrics(self._folder, self._checkpoints, sys.maxsize)):
                     self._echo(note)
-                self._echo(earlier.finished_message(self._folder, self._checkpoints, self._config, self._total))
+                self._echo(resume_checks.finished_message(self._folder, self._checkpoints, self._config, self._total))
                 return
             interruption = Interruption()
             try:
@@ -197,7 +199,7 @@ class RunLoop:
         self._echo(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
         restored = self._checkpoints.restore_for_resume(programs.shapes) if is_resumed else None
         if restored is not None:
-            earlier.check_missing_rows(self._folder, restored)
+            resume_checks.check_missing_rows(self._folder, restored)
             self._take_over(restored)
         elif is_resumed:
             self._echo("no usable checkpoint: starting at the beginning")
@@ -245,7 +247,7 @@ class RunLoop:
         try:
             if overwrite and self._folder.config.exists():
                 with self._saver.writing():
-                    for line in earlier.set_foreign_files_aside(self._folder, self._checkpoints):
+                    for line in resume_checks.set_foreign_files_aside(self._folder, self._checkpoints):
                         self._echo(line)
             self._folder.open(self._config, is_resumed, overwrite, self._log)
         except RequestError:
@@ -261,22 +263,24 @@ class RunLoop:
             foreign: Checkpoints of other runs that were set aside.
         """
         if is_resumed:
-            if note := earlier.truncate_metrics(self._folder, self._checkpoints, self._done, bool(damaged), self._evaluated_at):
+            if note := resume_checks.truncate_metrics(
+                self._folder, self._checkpoints, self._done, bool(damaged), self._evaluated_at
+            ):
                 self._echo(note)
             self._evaluated_seeds = {row["seed"] for row in self._folder.rows() if row["iteration"] == self._done}
         for path in damaged:
             self._echo(f"kept for inspection: {path}")
         for path in foreign:
-            self._echo(earlier.foreign_message(path))
+            self._echo(resume_checks.foreign_message(path))
         self._loggers.open(read_record(self._folder.path), self._programs.seeds, self._folder.rows())
 
     def _take_over(self, restored: Restored) -> None:
         self._progress = Progress.from_dict(restored.progress)
-        self._done, self._evaluated_at = restored.iteration, earlier.last_evaluation(restored)
-        if earlier.has_ended_early(self._folder, self._config, self._programs.seeds, self._done):
+        self._done, self._evaluated_at = restored.iteration, resume_checks.last_evaluation(restored)
+        if resume_checks.has_ended_early(self._folder, self._config, self._programs.seeds, self._done):
             self._total = min(self._total, self._done)
         # A run that had all its steps but not the evaluation, or is resumed with fewer total steps, ends with an evaluation.
-        self._progress.evaluation_due |= self._done >= self._total and not earlier.is_evaluated(
+        self._progress.evaluation_due |= self._done >= self._total and not resume_checks.is_evaluated(
             self._folder, self._programs.seeds, restored
         )
         self._owed_evaluation = self._progress.evaluation_due
@@ -285,7 +289,7 @@ class RunLoop:
             self._recent_at = restored.iteration if restored.tier == RECENT else None
             self._echo(f"resumed at iteration {self._done} of {self._total}, exactly")
             return
-        self._loop = earlier.state_without_replay(self._programs, restored)
+        self._loop = resume_checks.state_without_replay(self._programs, restored)
         if self._done < self._total:
             self._progress.replay_lost_at, self._replay_lost = self._done, True
         self._echo(

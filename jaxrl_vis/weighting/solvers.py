@@ -151,7 +151,7 @@ class _Bracket(NamedTuple):
     high: jax.Array  # [] t with |g_w(t)| <= t
     at_low: jax.Array  # [] |g_w(t)| - t at low, halved if this end was kept twice
     at_high: jax.Array  # [] likewise at high
-    kept_end: jax.Array  # [] int32, end kept by the last step: -1 low, 1 high
+    last_kept_end: jax.Array  # [] int32, end kept by the last step: -1 low, 1 high
     free: jax.Array  # [K] bool
     error: jax.Array  # [] |g_w(t)| - t at the latest t
     steps: jax.Array
@@ -192,8 +192,8 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
         _, length, free = evaluate(t, state.free)
         above = length > t
         error = length - t
-        at_low = jnp.where(above, error, jnp.where(state.kept_end == -1, 0.5 * state.at_low, state.at_low))
-        at_high = jnp.where(above, jnp.where(state.kept_end == 1, 0.5 * state.at_high, state.at_high), error)
+        at_low = jnp.where(above, error, jnp.where(state.last_kept_end == -1, 0.5 * state.at_low, state.at_low))
+        at_high = jnp.where(above, jnp.where(state.last_kept_end == 1, 0.5 * state.at_high, state.at_high), error)
         low, high = jnp.where(above, t, state.low), jnp.where(above, state.high, t)
         return _Bracket(low, high, at_low, at_high, jnp.where(above, 1, -1).astype(jnp.int32), free, error, state.steps + 1)
 
@@ -207,7 +207,7 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
     first = _Bracket(zero, one, one, jnp.minimum(at_one - one, -eps), jnp.int32(0), free, one, jnp.int32(0))
     last = jax.lax.while_loop(is_open, step, first)
     # The last error is that of the end that moved last.
-    weights, length, _ = evaluate(jnp.where(last.kept_end == 1, last.low, last.high), last.free, passes=3)
+    weights, length, _ = evaluate(jnp.where(last.last_kept_end == 1, last.low, last.high), last.free, passes=3)
     return weights, length
 
 

@@ -142,7 +142,7 @@ def test_unchanging_images_are_refused() -> None:
 
 
 def test_calls_alternate_between_batches() -> None:
-    draw = variation.alternate(lambda batch: batch, [1, 2])
+    draw = variation.cycle_batches(lambda batch: batch, [1, 2])
     assert [draw() for _ in range(5)] == [1, 2, 1, 2, 1]
 
 

@@ -24,7 +24,7 @@ from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import trainer
 from jaxrl_vis.run.compiled import trace_cache
 from jaxrl_vis.run.compiled.programs import Programs
-from jaxrl_vis.run.compiled.trace_cache import VARIABLE, fingerprint
+from jaxrl_vis.run.compiled.trace_cache import CACHE_VARIABLE, fingerprint
 from jaxrl_vis.run.storage.folder import RunFolder
 from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.compiling import compilation
@@ -193,7 +193,7 @@ def test_environments_from_elsewhere_are_not_kept(folder, monkeypatch):
         pass
 
     assert fingerprint(CONFIG, object.__new__(Own)) is None
-    monkeypatch.setenv(VARIABLE, "0")
+    monkeypatch.setenv(CACHE_VARIABLE, "0")
     assert fingerprint(CONFIG, env) is None
 
 

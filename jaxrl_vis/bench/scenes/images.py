@@ -22,7 +22,7 @@ from jaxrl_vis.bench.scenes import models, operations, program_memory
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
-from jaxrl_vis.bench.variation import alternate, assert_new_images
+from jaxrl_vis.bench.variation import assert_new_images, cycle_batches
 from jaxrl_vis_envs.render import Scene, quantize, render_planes
 
 CPU_COUNTS = (64,)
@@ -187,7 +187,7 @@ def measure_output(case: Case, output: str, repeats: int) -> Measurement:
     program, compile_s = compile_timed(jaxrl_vis_envs.jit(draw), scene_argument, batches[0])
     compiled = functools.partial(program, scene_argument)
     assert_new_images(compiled, batches)
-    timing = measure_time(alternate(compiled, batches), repeats)
+    timing = measure_time(cycle_batches(compiled, batches), repeats)
     sample = {name: rows[:_SAMPLE] for name, rows in case.batches[0].items()}
     tests = models.needed_tests(mj_model, sample, size)
     pixel_operations = operations.operations_per_pixel(scene, tests, coloured=output != "depth")

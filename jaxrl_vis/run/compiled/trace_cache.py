@@ -38,7 +38,7 @@ from jaxrl_vis.types import Episodes
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compiling.compilation import target_platform, tracing_for_default_device, use_gpu_kernels
 
-VARIABLE = "JAXRL_VIS_KEEP_PROGRAMS"
+CACHE_VARIABLE = "JAXRL_VIS_KEEP_PROGRAMS"
 MAX_FILES = 300
 """Maximum number of files, of half a megabyte each; the oldest are deleted."""
 
@@ -62,7 +62,7 @@ def fingerprint(config: Config, env: GoalEnv, learner: Any = None) -> str | None
         learner: Tree of the learner, or of a policy; only its structure counts.
     """
     is_ours = type(env).__module__.partition(".")[0] in _PACKAGES and not custom_names(config)
-    if not is_ours or os.environ.get(VARIABLE) == "0":
+    if not is_ours or os.environ.get(CACHE_VARIABLE) == "0":
         return None
     settings = {name: value for name, value in jax.config.values.items() if not any(part in name for part in _WITHOUT_EFFECT)}
     with tracing_for_default_device():

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.host import distributed, streams
 from jaxrl_vis.host.files import read_json
-from jaxrl_vis.run.storage import hush, restoring, sums
+from jaxrl_vis.run.storage import restoring, silencing, sums
 from jaxrl_vis.run.storage.arrays import describe, saved_leaves
 from jaxrl_vis.run.storage.manifest import FILE, SCHEMA
 from jaxrl_vis.run.storage.metrics import RUN_ID
@@ -98,7 +98,7 @@ class Checkpoints:
 
         if tier not in self._managers:
             if self._unsilence is None:
-                self._unsilence = hush.silence_orbax()
+                self._unsilence = silencing.silence_orbax()
             # orbax measures timeouts with the system clock: a change of the clock could abort a good save. A single process
             # waits for its own disk indefinitely; with several, one that hangs must be detected.
             patient = AsyncOptions(timeout_secs=_TIMEOUT_S, create_directories_asynchronously=False)
@@ -399,7 +399,7 @@ class Checkpoints:
 
         try:
             manager = self._manager(tier)  # first, because `silenced` restores the hooks that it finds
-            with hush.silenced():
+            with silencing.silenced():
                 return manager.restore(iteration, args=ocp.args.Composite(**arguments))
         # orbax and tensorstore report damage by arbitrary exceptions, plain Exception included.
         except Exception as error:

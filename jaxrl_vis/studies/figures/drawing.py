@@ -26,14 +26,14 @@ class Curve:
         colour: Colour of the line.
         steps: [P] environment steps.
         values: [S, P], one row per seed, NaN for gaps.
-        behind: Whether these are published results of others, drawn thin, dashed and behind the others.
+        is_reference: Whether these are published results of others, drawn thin, dashed and behind the others.
     """
 
     label: str
     colour: str
     steps: np.ndarray
     values: np.ndarray
-    behind: bool = False
+    is_reference: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,10 +140,10 @@ def _break_lines(text: str, max_characters: int) -> list[str]:
 
 
 def _draw(axes: Axes, panel: Panel) -> None:
-    ends = [int(curve.steps[-1]) for curve in panel.curves if curve.steps.size and not curve.behind]
+    ends = [int(curve.steps[-1]) for curve in panel.curves if curve.steps.size and not curve.is_reference]
     end = max(ends, default=1)
     for curve in panel.curves:
-        if curve.behind:
+        if curve.is_reference:
             style = {"linewidth": 1.3, "linestyle": (0, (4, 2)), "alpha": 0.75, "zorder": 1}
             axes.plot(curve.steps, np.median(curve.values, axis=0), color=curve.colour, label=curve.label, **style)
         else:

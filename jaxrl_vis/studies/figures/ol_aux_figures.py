@@ -26,7 +26,7 @@ def make_content(request: Request, lines: Lines, tasks: Sequence[str], variants:
     is_weights = request.figure == WEIGHTS
     panels = [Panel(task, (_weights if is_weights else _success)(lines, task, variants), not is_weights) for task in tasks]
     text, rows = _weights_table(request, lines, tasks) if is_weights else _steps_table(lines, tasks)
-    subtitle = "dashed: authors' release" if any(c.behind for panel in panels for c in panel.curves) else ""
+    subtitle = "dashed: authors' release" if any(c.is_reference for panel in panels for c in panel.curves) else ""
     title = f"Weights of the auxiliary losses in {VARIANTS[variants[0]].label}" if is_weights else ""
     return FigureContent([Picture("", [panels], subtitle)], text, rows, _notes(request, lines), title)
 
@@ -43,7 +43,7 @@ def _success(lines: Lines, task: str, shown: Sequence[str]) -> list[Curve]:
         if len(points) > 1:
             steps, success = np.array(points).T
             label = f"{VARIANTS[variant].label} ({_AUTHORS})"
-            theirs.append(Curve(label, VARIANTS[variant].colour, steps, success[None], behind=True))
+            theirs.append(Curve(label, VARIANTS[variant].colour, steps, success[None], is_reference=True))
     return theirs + ours
 
 
