@@ -149,18 +149,18 @@ def test_copies_of_a_stalk_leave_room_for_another():
     easy, hard = jnp.array([20.0, 10.0, 40.0, 40.0, 22.0, 38.0]), jnp.array([20.0, 10.0, 40.0, 40.0, 38.0, 22.0])
     anchors = jnp.concatenate([jnp.tile(easy, (99, 1)), hard[None]])
     logits = jnp.linspace(5.0, 1.0, len(anchors))
-    codes = jnp.zeros((len(anchors), 6))
+    offsets = jnp.zeros((len(anchors), 6))
     for candidates, wanted in ((99, [easy]), (100, [easy, hard])):
         settings = dataclasses.replace(TINY, candidates=candidates)
-        stalks, _, valid = select_proposals(logits, codes, anchors, settings, (60, 64))
+        stalks, _, valid = select_proposals(logits, offsets, anchors, settings, (60, 64))
         np.testing.assert_allclose(stalks[valid], jnp.stack(wanted), atol=1e-5)
 
 
 def test_boxes_on_unclear_stalks_are_neither_right_nor_wrong():
     truth = jnp.array([[10.0, 0, 20, 60], [40, 0, 50, 60], [70, 0, 80, 60]])
     kinds = jnp.array([STALK, UNCLEAR, NOTHING])
-    which, shows, none = assign_boxes(box_iou(truth, truth), kinds, 0.5, 0.3)
-    assert which[0] == 0 and shows.tolist() == [True, False, False] and none.tolist() == [False, False, True]
+    which, positive, negative = assign_boxes(box_iou(truth, truth), kinds, 0.5, 0.3)
+    assert which[0] == 0 and positive.tolist() == [True, False, False] and negative.tolist() == [False, False, True]
 
 
 # --- crops ---

@@ -101,7 +101,7 @@ def test_scores_of_finds():
     right, ignored = match_to_annotations(stalks, scores, truth, kinds)
     assert right.tolist() == [True, False, False, False] and ignored.tolist() == [False, False, True, False]
     result = score_detections([ImageDetections(stalks, scores, right, ignored, 2)])
-    assert (result.finds, result.right, result.labels) == (2, 1, 2)
+    assert (result.detections, result.true_positives, result.labels) == (2, 1, 2)
     assert result.precision == result.recall == result.f1 == 0.5
     assert result.soft == pytest.approx(2 * 0.9 / (0.9 + 0.8 + 0.3 + 2))
     # As good with a higher threshold; F1 does not see that the wrong one became less sure.

@@ -128,7 +128,7 @@ def _report(
     from jaxrl_vis.stalks.phenotyping.training.held_out import mask_overlap, score_detections
 
     test = [examples[place] for place in split.test]
-    scores = {name: score_detections(finds) for name, finds in (("before", tuned.before), ("after", tuned.after))}
+    scores = {name: score_detections(detections) for name, detections in (("before", tuned.before), ("after", tuned.after))}
     overlaps = dict.fromkeys(scores, math.nan)
     if masks:
         pairs = {"before": start, "after": tuned.params}
@@ -140,9 +140,9 @@ def _report(
     for name, result in scores.items():
         overlap = overlaps.get(name, math.nan)
         echo(
-            f"{name:6} on {result.images} held-out images: {result.right} of {result.labels} "
+            f"{name:6} on {result.images} held-out images: {result.true_positives} of {result.labels} "
             f"{'sections' if settings.section else 'stalks'} found, "
-            f"{result.finds - result.right} false finds, F1 {result.f1:.2f}, AP50 {result.ap50:.2f}"
+            f"{result.detections - result.true_positives} false finds, F1 {result.f1:.2f}, AP50 {result.ap50:.2f}"
             + (f", masks overlap {overlap:.2f}" if math.isfinite(overlap) else "")
         )
     facts = [

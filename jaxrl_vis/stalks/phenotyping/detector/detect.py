@@ -170,13 +170,13 @@ def pool_regions(features: jax.Array, stalks: jax.Array, section: int = 0) -> ja
 
 
 def select_proposals(
-    logits: jax.Array, codes: jax.Array, anchors: jax.Array, settings: Settings, shape: tuple[int, int]
+    logits: jax.Array, offsets: jax.Array, anchors: jax.Array, settings: Settings, shape: tuple[int, int]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Select the best proposals of one image after non-maximum suppression.
 
     Args:
         logits: Objectness logits [K] of the anchors.
-        codes: Box offsets [K, 6].
+        offsets: Box offsets [K, 6].
         anchors: [K, 6].
         settings: Number of proposals and the suppression threshold.
         shape: Height and width of the image, to which proposals are clipped.
@@ -187,7 +187,7 @@ def select_proposals(
     """
     count = min(settings.candidates, logits.shape[0])
     scores, places = jax.lax.top_k(logits, count)
-    stalks = clip_to_image(decode(codes[places], anchors[places]), shape)
+    stalks = clip_to_image(decode(offsets[places], anchors[places]), shape)
     size = stalks[:, 2:4] - stalks[:, :2]
     selected = non_maximum_suppression(strip_overlap(stalks, stalks), scores, settings.proposal_threshold)
     selected &= (size[:, 0] > 2.0) & (size[:, 1] > 8.0)
@@ -197,13 +197,13 @@ def select_proposals(
 
 
 def section_proposals(
-    logits: jax.Array, codes: jax.Array, anchors: jax.Array, settings: Settings
+    logits: jax.Array, offsets: jax.Array, anchors: jax.Array, settings: Settings
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Select the best proposals of sections of one image after non-maximum suppression in each band.
 
     Args:
         logits: Objectness logits [K] of the anchors.
-        codes: Box offsets [K, 6].
+        offsets: Box offsets [K, 6].
         anchors: [B, A, 6], see `section_anchors`.
         settings: Number of proposals and the suppression threshold.
 
@@ -214,12 +214,12 @@ def section_proposals(
     count = min(max(settings.candidates // bands, 1), each)
     scores, places = jax.lax.top_k(logits.reshape(bands, each), count)
 
-    def select_in_band(scores, places, codes, anchors):
-        stalks = decode_sections(codes[places], anchors[places])
+    def select_in_band(scores, places, offsets, anchors):
+        stalks = decode_sections(offsets[places], anchors[places])
         selected = non_maximum_suppression(strip_overlap(stalks, stalks, 4), scores, settings.proposal_threshold)
         return stalks, jnp.where(selected & (stalks[:, 2] - stalks[:, 0] > 2.0), scores, -jnp.inf)
 
-    stalks, scores = jax.vmap(select_in_band)(scores, places, codes.reshape(bands, each, 6), anchors)
+    stalks, scores = jax.vmap(select_in_band)(scores, places, offsets.reshape(bands, each, 6), anchors)
     best, places = jax.lax.top_k(scores.reshape(-1), min(settings.proposals, bands * count))
     return stalks.reshape(-1, 6)[places], places // count, jnp.isfinite(best)
 
@@ -247,9 +247,9 @@ def apply_heads(
     Returns:
         Logits [N, K] float32 and box offsets [N, K, 6] float32 of the anchors, or [R] and [R, 6] of the regions.
     """
-    logits, codes = network.apply(params, features, method=method)
-    assert isinstance(logits, jax.Array) and isinstance(codes, jax.Array)
-    return logits, codes
+    logits, offsets = network.apply(params, features, method=method)
+    assert isinstance(logits, jax.Array) and isinstance(offsets, jax.Array)
+    return logits, offsets
 
 
 def classify_proposals(
@@ -269,9 +269,9 @@ def classify_proposals(
         At most ``settings.max_stalks`` stalks or sections, without pooled features.
     """
     regions = pool_regions(features, proposals, settings.section)
-    logits, codes = apply_heads(network, params, regions, "classify")
+    logits, offsets = apply_heads(network, params, regions, "classify")
     scores = jax.nn.sigmoid(logits)
-    stalks = (decode_sections if settings.section else decode)(codes, proposals)
+    stalks = (decode_sections if settings.section else decode)(offsets, proposals)
     valid = valid & (scores >= settings.min_score)
     selected = non_maximum_suppression(strip_overlap(stalks, stalks), jnp.where(valid, scores, -1.0), settings.threshold, valid)
     best, places = jax.lax.top_k(jnp.where(selected, scores, -1.0), min(settings.max_stalks, scores.shape[0]))
@@ -295,13 +295,13 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
     shape = (image.shape[0], image.shape[1])
     features = network.apply(params, normalise(image)[None], method="features")
     assert isinstance(features, jax.Array)
-    logits, codes = apply_heads(network, params, features, "propose")
+    logits, offsets = apply_heads(network, params, features, "propose")
     if settings.section:
         anchors = jnp.asarray(section_anchors(shape, settings.section, settings.anchor_widths))
-        proposals, _, valid = section_proposals(logits[0], codes[0], anchors, settings)
+        proposals, _, valid = section_proposals(logits[0], offsets[0], anchors, settings)
     else:
         anchors = jnp.asarray(make_anchors(shape, settings.band_height, settings.anchor_widths))
-        proposals, _, valid = select_proposals(logits[0], codes[0], anchors, settings, shape)
+        proposals, _, valid = select_proposals(logits[0], offsets[0], anchors, settings, shape)
     detected = classify_proposals(network, params, features[0], proposals, valid, settings)
     return dataclasses.replace(detected, pooled=_pool_features(features[0], image))
 

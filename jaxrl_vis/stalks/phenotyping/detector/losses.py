@@ -15,30 +15,34 @@ from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import preprocess_crops
 
 
 def assign_boxes(
-    overlaps: jax.Array, kinds: jax.Array, positive: float, negative: float, best_of_stalk: jax.Array | None = None
+    overlaps: jax.Array,
+    kinds: jax.Array,
+    positive_overlap: float,
+    negative_overlap: float,
+    best_of_stalk: jax.Array | None = None,
 ) -> tuple[jax.Array, ...]:
     """Assign boxes to true stalks.
 
     Args:
         overlaps: [K, T] overlaps of boxes and true stalks.
         kinds: [T] or [K, T] int32: NOTHING, UNCLEAR or STALK.
-        positive: Minimum overlap of a positive box.
-        negative: Overlap below which a box is negative.
+        positive_overlap: Minimum overlap of a positive box.
+        negative_overlap: Overlap below which a box is negative.
         best_of_stalk: [K, T] maximum overlap of each true stalk with any box; None to compute it over all boxes.
 
     Returns:
         Index of the assigned stalk [K] int32, positives [K] bool and negatives [K] bool. Boxes between both thresholds, and
         those on unclear stalks that are not positive, are ignored. The best box of a stalk is positive from an overlap of 0.2.
     """
-    unclear = jnp.where(kinds == UNCLEAR, overlaps, 0.0).max(axis=1) >= negative
+    unclear = jnp.where(kinds == UNCLEAR, overlaps, 0.0).max(axis=1) >= negative_overlap
     overlaps = jnp.where(kinds == STALK, overlaps, 0.0)
     best = overlaps.max(axis=1)
     # The best box of each stalk is positive even below the threshold.
     best_of_stalk = overlaps.max(axis=0) if best_of_stalk is None else best_of_stalk
     forced = (overlaps >= best_of_stalk - 1e-6) & (best_of_stalk > 0.2)
     which = jnp.where(forced.any(axis=1), jnp.argmax(jnp.where(forced, overlaps, -1.0), axis=1), jnp.argmax(overlaps, axis=1))
-    shows = (best >= positive) | forced.any(axis=1)
-    return which, shows, (best < negative) & ~unclear & ~shows
+    positive = (best >= positive_overlap) | forced.any(axis=1)
+    return which, positive, (best < negative_overlap) & ~unclear & ~positive
 
 
 def detector_loss(
@@ -63,51 +67,51 @@ def detector_loss(
     anchors = jnp.asarray(make_anchors(shape, settings.band_height, settings.anchor_widths))
     features = network.apply(params, normalise(images), method="features")
     assert isinstance(features, jax.Array)
-    logits, codes = apply_heads(network, params, features, "propose")
+    logits, offsets = apply_heads(network, params, features, "propose")
 
-    def image_loss(features, logits, codes, truth, kinds, key):
-        which, shows, none = assign_boxes(box_iou(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
-        loss = focal_loss(logits, shows, none) / jnp.maximum(shows.sum(), 1)
-        placed = offset_loss(codes, encode(truth[which], anchors), shows)
+    def image_loss(features, logits, offsets, truth, kinds, key):
+        which, positive, negative = assign_boxes(box_iou(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
+        loss = focal_loss(logits, positive, negative) / jnp.maximum(positive.sum(), 1)
+        placed = offset_loss(offsets, encode(truth[which], anchors), positive)
 
-        proposals, _, valid = select_proposals(*jax.lax.stop_gradient((logits, codes)), anchors, settings, shape)
+        proposals, _, valid = select_proposals(*jax.lax.stop_gradient((logits, offsets)), anchors, settings, shape)
         size = jnp.concatenate([truth[:, 2:4] - truth[:, :2]] * 2 + [truth[:, 2:3] - truth[:, :1]] * 2, axis=-1)
         near = truth + 0.15 * jax.random.normal(key, truth.shape) * size
         proposals = jnp.concatenate([proposals, near])
         valid = jnp.concatenate([valid, kinds == STALK])
         # In a clump, a box between two stalks overlaps both by half, but its strip overlaps neither.
         alike = 0.5 * (box_iou(proposals[:, :4], truth[:, :4]) + strip_overlap(proposals, truth))
-        which, shows, none = assign_boxes(alike, kinds, 0.5, 0.45)
-        shows, none = shows & valid, none & valid
+        which, positive, negative = assign_boxes(alike, kinds, 0.5, 0.45)
+        positive, negative = positive & valid, negative & valid
         judged, refined = apply_heads(network, params, pool_regions(features, proposals), "classify")
-        weight = (shows | none).astype(jnp.float32)
-        right = optax.sigmoid_binary_cross_entropy(judged, shows.astype(jnp.float32))
-        judgement = (right * weight).sum() / jnp.maximum(weight.sum(), 1.0)
-        refinement = offset_loss(refined, encode(truth[which], proposals), shows)
+        weight = (positive | negative).astype(jnp.float32)
+        entropy = optax.sigmoid_binary_cross_entropy(judged, positive.astype(jnp.float32))
+        judgement = (entropy * weight).sum() / jnp.maximum(weight.sum(), 1.0)
+        refinement = offset_loss(refined, encode(truth[which], proposals), positive)
         return loss, placed, 2.0 * judgement, 2.0 * refinement
 
     keys = jax.random.split(key, images.shape[0])
-    parts = jax.vmap(image_loss)(features, logits, codes, truth, kinds, keys)
+    parts = jax.vmap(image_loss)(features, logits, offsets, truth, kinds, keys)
     named = {name: part.mean() for name, part in zip(("objectness", "offsets", "head", "boxes"), parts)}
     return sum(named.values(), jnp.zeros(())), named
 
 
-def focal_loss(logits: jax.Array, shows: jax.Array, none: jax.Array) -> jax.Array:
-    """Sum the focal loss (alpha 0.5, gamma 2) of logits [K] over positive (``shows``) and negative (``none``) anchors.
+def focal_loss(logits: jax.Array, positive: jax.Array, negative: jax.Array) -> jax.Array:
+    """Sum the focal loss (alpha 0.5, gamma 2) of logits [K] over ``positive`` and ``negative`` anchors.
 
     Both are [K] bool; anchors that are neither are ignored. Source: Lin et al. (2017), arXiv 1708.02002.
     """
-    loss = optax.sigmoid_focal_loss(logits, shows.astype(jnp.float32), alpha=0.5, gamma=2.0)
-    return (loss * (shows | none)).sum()
+    loss = optax.sigmoid_focal_loss(logits, positive.astype(jnp.float32), alpha=0.5, gamma=2.0)
+    return (loss * (positive | negative)).sum()
 
 
-def offset_loss(offsets: jax.Array, targets: jax.Array, shows: jax.Array) -> jax.Array:
+def offset_loss(offsets: jax.Array, targets: jax.Array, positive: jax.Array) -> jax.Array:
     """Compute the Huber loss of box offsets [K, 6], summed over the six and averaged over the positive boxes.
 
-    ``targets`` [K, 6] are clipped to -20 to 20; ``shows`` [K] bool is True for positive boxes. The loss is 0 without these.
+    ``targets`` [K, 6] are clipped to -20 to 20; ``positive`` [K] bool is True for positive boxes. The loss is 0 without these.
     """
     loss = optax.huber_loss(offsets, jnp.clip(targets, -20.0, 20.0), delta=1.0).sum(axis=-1)
-    return (loss * shows).sum() / jnp.maximum(shows.sum(), 1)
+    return (loss * positive).sum() / jnp.maximum(positive.sum(), 1)
 
 
 def segmenter_loss(params: Any, crops: jax.Array, masks: jax.Array, settings: Settings, dtype: Any) -> jax.Array:

@@ -45,21 +45,21 @@ def section_loss(
     anchors = jnp.asarray(section_anchors((images.shape[1], images.shape[2]), settings.section, settings.anchor_widths))
     features = network.apply(params, normalise(images), method="features")
     assert isinstance(features, jax.Array)
-    logits, codes = apply_heads(network, params, features, "propose")
+    logits, offsets = apply_heads(network, params, features, "propose")
 
-    def image_loss(features, logits, codes, edges, kinds, size, key):
+    def image_loss(features, logits, offsets, edges, kinds, size, key):
         truth, kinds = true_sections(edges, kinds, size, settings.section)
 
         def assign_anchors(anchors, truth, kinds):
-            which, shows, none = assign_boxes(box_iou(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
-            return truth[which], shows, none
+            which, positive, negative = assign_boxes(box_iou(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
+            return truth[which], positive, negative
 
-        wanted, shows, none = jax.vmap(assign_anchors)(anchors, truth, kinds)
-        shows, none = shows.reshape(-1), none.reshape(-1)
-        loss = focal_loss(logits, shows, none) / jnp.maximum(shows.sum(), 1)
-        placed = offset_loss(codes, encode(wanted, anchors).reshape(-1, 6), shows)
+        wanted, positive, negative = jax.vmap(assign_anchors)(anchors, truth, kinds)
+        positive, negative = positive.reshape(-1), negative.reshape(-1)
+        loss = focal_loss(logits, positive, negative) / jnp.maximum(positive.sum(), 1)
+        placed = offset_loss(offsets, encode(wanted, anchors).reshape(-1, 6), positive)
 
-        proposals, bands, valid = section_proposals(*jax.lax.stop_gradient((logits, codes)), anchors, settings)
+        proposals, bands, valid = section_proposals(*jax.lax.stop_gradient((logits, offsets)), anchors, settings)
         near, near_bands, near_valid = _jittered(truth, kinds, key)
         proposals, bands = jnp.concatenate([proposals, near]), jnp.concatenate([bands, near_bands])
         valid = jnp.concatenate([valid, near_valid])
@@ -69,17 +69,17 @@ def section_loss(
 
         alike = jax.vmap(similarity)(proposals, truth[bands])
         best = jnp.zeros(kinds.shape).at[bands].max(jnp.where(kinds[bands] == STALK, alike, 0.0))
-        which, shows, none = assign_boxes(alike, kinds[bands], 0.5, 0.45, best[bands])
-        shows, none = shows & valid, none & valid
+        which, positive, negative = assign_boxes(alike, kinds[bands], 0.5, 0.45, best[bands])
+        positive, negative = positive & valid, negative & valid
         judged, refined = apply_heads(network, params, pool_regions(features, proposals, settings.section), "classify")
-        weight = (shows | none).astype(jnp.float32)
-        right = optax.sigmoid_binary_cross_entropy(judged, shows.astype(jnp.float32))
-        judgement = (right * weight).sum() / jnp.maximum(weight.sum(), 1.0)
-        refinement = offset_loss(refined, encode(truth[bands, which], proposals), shows)
+        weight = (positive | negative).astype(jnp.float32)
+        entropy = optax.sigmoid_binary_cross_entropy(judged, positive.astype(jnp.float32))
+        judgement = (entropy * weight).sum() / jnp.maximum(weight.sum(), 1.0)
+        refinement = offset_loss(refined, encode(truth[bands, which], proposals), positive)
         return loss, placed, 2.0 * judgement, 2.0 * refinement
 
     keys = jax.random.split(key, images.shape[0])
-    parts = jax.vmap(image_loss)(features, logits, codes, edges, kinds, sizes, keys)
+    parts = jax.vmap(image_loss)(features, logits, offsets, edges, kinds, sizes, keys)
     named = {name: part.mean() for name, part in zip(("objectness", "offsets", "head", "boxes"), parts)}
     return sum(named.values(), jnp.zeros(())), named
 

@@ -44,9 +44,9 @@ def section_anchors(shape: tuple[int, int], section: int, widths: tuple[float, .
     return anchors[None] + down[:, None].astype(np.float32)
 
 
-def decode_sections(codes: jax.Array, anchors: jax.Array) -> jax.Array:
+def decode_sections(offsets: jax.Array, anchors: jax.Array) -> jax.Array:
     """Decode box offsets [..., 6] to sections [..., 6], whose top and bottom are those of the ``anchors`` [..., 6]."""
-    stalks = decode(codes, anchors)
+    stalks = decode(offsets, anchors)
     return stalks.at[..., 1].set(anchors[..., 1]).at[..., 3].set(anchors[..., 3])
 
 

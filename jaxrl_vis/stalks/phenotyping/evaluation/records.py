@@ -162,8 +162,8 @@ def _make_record(score: PlotScore, pairs: int) -> Record:
         "seconds_per_pair": None if math.isnan(score.seconds) else round(score.seconds, 4),
         "pairs": pairs,
         "stalks_in_view": score.stalks,
-        "scores": score.finds[:, 0].round(4).tolist(),
-        "right": "".join("1" if right else "0" for right in score.finds[:, 1]),
+        "scores": score.detections[:, 0].round(4).tolist(),
+        "right": "".join("1" if right else "0" for right in score.detections[:, 1]),
         "thesis": thesis and {"counted": round(thesis.counted, 4), "widths_mm": thesis.widths.round(4).tolist()},
     }
 
@@ -181,7 +181,7 @@ def _read_score(record: Record) -> PlotScore:
         true=record["true"],
         counted=record["counted"],
         widths=pairs(record["widths_mm"]),
-        finds=np.stack([np.array(record["scores"], float), right], axis=1),
+        detections=np.stack([np.array(record["scores"], float), right], axis=1),
         stalks=record["stalks_in_view"],
         upper=pairs(record["widths_24in_mm"]),
         errors=np.array(record["width_errors_mm"], float),

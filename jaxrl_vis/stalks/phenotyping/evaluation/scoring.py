@@ -43,8 +43,8 @@ class PlotScore:
         seconds: Mean time of detection and measurement per pair, images in memory, without the first pair, which includes
             compilation; NaN for a single pair.
         thesis: Score of the thesis's methods on the same detections; None if they were not evaluated.
-        finds: Score of each detection, and 1 for a true or 0 for a false positive, [K, 2] float64; matches of mostly occluded
-            stalks are left out.
+        detections: Score of each detection, and 1 for a true or 0 for a false positive, [K, 2] float64; matches of mostly
+            occluded stalks are left out.
         stalks: Number of detectable stalks (ground-truth positives), summed over all pairs.
     """
 
@@ -52,7 +52,7 @@ class PlotScore:
     true: int
     counted: int
     widths: np.ndarray
-    finds: np.ndarray
+    detections: np.ndarray
     stalks: int
     upper: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
     seconds: float = math.nan
@@ -97,7 +97,7 @@ def score_plot(
     distance = plot.family.rig.distance if plot.family.scene.share > 0 else USUAL_DISTANCE
     frames: list[list[Sighting]] = []
     owners: list[list[int | None]] = []
-    finds: list[tuple[float, float]] = []
+    scored_detections: list[tuple[float, float]] = []
     as_thesis: list[list[Sighting]] = []
     total, seconds = 0, []
     for pair in sequence:
@@ -107,14 +107,14 @@ def score_plot(
         finder = find or functools.partial(_true_detections, stalks, instance)
         detections, ground = detect_with_ground(finder, left, right, drive.stated, distance=distance)
         selected = [place for place, detection in enumerate(detections) if detection.score >= min_score]
-        finds_kept = [detections[place] for place in selected]
-        frames.append(measure_pair(finds_kept, left, right, drive.stated, method, ground))
+        kept_detections = [detections[place] for place in selected]
+        frames.append(measure_pair(kept_detections, left, right, drive.stated, method, ground))
         seconds.append(time.monotonic() - started)
         if with_thesis:
-            as_thesis.append(measure_pair_as_thesis(finds_kept, left, right, drive.stated))
+            as_thesis.append(measure_pair_as_thesis(kept_detections, left, right, drive.stated))
         matched, scored = match_detections(detections, stalks)
         total += sum(stalk.band_box is not None and stalk.band_visible >= MIN_VISIBLE for stalk in stalks)
-        finds += scored
+        scored_detections += scored
         owners.append([matched[place] for place in selected])
     tracks, _ = track_stalks(frames, drive.odometry, drive.stated)
     widths, upper, errors = [], [], []
@@ -135,7 +135,7 @@ def score_plot(
         len(plot.measured),
         len(counted),
         np.array(widths).reshape(-1, 2),
-        np.array(finds).reshape(-1, 2),
+        np.array(scored_detections).reshape(-1, 2),
         total,
         np.array(upper).reshape(-1, 2),
         float(np.mean(seconds[1:])) if len(seconds) > 1 else math.nan,
@@ -208,18 +208,18 @@ def iou_with_boxes(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return common / np.maximum(np.prod(box[2:] - box[:2]) + areas - common, 1e-9)
 
 
-def average_precision(finds: np.ndarray, stalks: int) -> float:
+def average_precision(detections: np.ndarray, stalks: int) -> float:
     """Compute COCO's average precision: the mean over 101 recall levels of the maximum precision at that recall or higher.
 
     It is 0 without detections or stalks.
 
     Args:
-        finds: Score of each detection, and 1 if it is correct, else 0, [K, 2].
+        detections: Score of each detection, and 1 if it is correct, else 0, [K, 2].
         stalks: Number of stalks to detect.
     """
-    if not stalks or not len(finds):
+    if not stalks or not len(detections):
         return 0.0
-    success = finds[np.argsort(-finds[:, 0], kind="stable"), 1]
+    success = detections[np.argsort(-detections[:, 0], kind="stable"), 1]
     hits = np.cumsum(success)
     precision = np.maximum.accumulate((hits / np.arange(1, len(hits) + 1))[::-1])[::-1]
     recall = hits / stalks
@@ -245,16 +245,16 @@ def summarise_scores(scores: Iterable[PlotScore], min_score: float = 0.5) -> dic
     true = np.array([score.true for score in scores], float)
     counted = np.array([score.counted for score in scores], float)
     widths = np.concatenate([score.widths for score in scores]) if scores else np.zeros((0, 2))
-    finds = np.concatenate([score.finds for score in scores]) if scores else np.zeros((0, 2))
+    detections = np.concatenate([score.detections for score in scores]) if scores else np.zeros((0, 2))
     stalks = sum(score.stalks for score in scores)
     error = widths[:, 0] - widths[:, 1]
     stated = np.concatenate([score.errors for score in scores]) if scores else np.zeros(0)
     upper = np.concatenate([score.upper for score in scores]) if scores else np.zeros((0, 2))
     upper_error = upper[:, 0] - upper[:, 1]
     people = np.random.default_rng(0).normal(0.0, PERSON_SD, (len(error), 2)).mean(axis=1)
-    selected = finds[finds[:, 0] >= min_score]
+    selected = detections[detections[:, 0] >= min_score]
     hits = float(selected[:, 1].sum())
-    best, best_score = _best_f1(finds, stalks)
+    best, best_score = _best_f1(detections, stalks)
     return {
         "plots": len(scores),
         "count_true": int(true.sum()),
@@ -271,7 +271,7 @@ def summarise_scores(scores: Iterable[PlotScore], min_score: float = 0.5) -> dic
         "width_24in_bias_mm": _mean(upper_error),
         "finds": len(selected),
         "stalks_in_view": stalks,
-        "ap50": average_precision(finds, stalks),
+        "ap50": average_precision(detections, stalks),
         "precision": hits / len(selected) if len(selected) else float("nan"),
         "recall": hits / stalks if stalks else float("nan"),
         "f1": 2.0 * hits / (len(selected) + stalks) if len(selected) + stalks else float("nan"),
@@ -282,15 +282,15 @@ def summarise_scores(scores: Iterable[PlotScore], min_score: float = 0.5) -> dic
     }
 
 
-def _best_f1(finds: np.ndarray, stalks: int) -> tuple[float, float]:
-    """Return the maximum F1 over all score thresholds, and that threshold; ``finds`` [K, 2] as in `PlotScore`."""
-    if not len(finds) or not stalks:
+def _best_f1(detections: np.ndarray, stalks: int) -> tuple[float, float]:
+    """Return the maximum F1 over all score thresholds, and that threshold; ``detections`` [K, 2] as in `PlotScore`."""
+    if not len(detections) or not stalks:
         return float("nan"), float("nan")
-    order = np.argsort(-finds[:, 0], kind="stable")
-    hits = np.cumsum(finds[order, 1])
+    order = np.argsort(-detections[:, 0], kind="stable")
+    hits = np.cumsum(detections[order, 1])
     f1 = 2.0 * hits / (np.arange(1, len(hits) + 1) + stalks)
     best = int(np.argmax(f1))
-    return float(f1[best]), float(finds[order[best], 0])
+    return float(f1[best]), float(detections[order[best], 0])
 
 
 def _thesis_summary(scores: list[PlotScore]) -> dict[str, float]:

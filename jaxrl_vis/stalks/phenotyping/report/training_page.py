@@ -21,7 +21,7 @@ _COLUMNS = {
     "weights": "weights",
     "images": "images",
     "labels": "annotated",
-    "right": "found",
+    "true_positives": "found",
     "false": "false finds",
     "precision": "precision",
     "recall": "recall",
@@ -35,7 +35,7 @@ def write_page(
     path: Path,
     facts: Sequence[str],
     examples: Sequence[Example],
-    finds: Mapping[str, Sequence[ImageDetections]],
+    detections: Mapping[str, Sequence[ImageDetections]],
     scores: Mapping[str, Score],
     overlaps: Mapping[str, float],
 ) -> None:
@@ -45,7 +45,7 @@ def write_page(
         path: The file, .html.
         facts: Lines of HTML about the training.
         examples: Held-out images; the first 60 are shown.
-        finds: Detections in each image, by name of the weights.
+        detections: Detections in each image, by name of the weights.
         scores: Scores of these detections, by name of the weights.
         overlaps: Mean overlap of masks, by name of the weights; NaN or missing if unknown.
 
@@ -54,12 +54,15 @@ def write_page(
     """
     rows = []
     for name, score in scores.items():
-        values = dataclasses.asdict(score) | {"masks": overlaps.get(name, math.nan), "false": score.finds - score.right}
+        values = dataclasses.asdict(score) | {
+            "masks": overlaps.get(name, math.nan),
+            "false": score.detections - score.true_positives,
+        }
         texts = {key: f"{value:.2f}" if isinstance(value, float) else value for key, value in values.items()}
         rows.append({"weights": name, **{key: "" if text == "nan" else text for key, text in texts.items()}})
     figures = []
     for index, example in enumerate(examples[:_MAX_IMAGES]):
-        shown = {name: draw_detections(example, of_set[index]) for name, of_set in finds.items()}
+        shown = {name: draw_detections(example, of_set[index]) for name, of_set in detections.items()}
         pictures = "".join(html_image(image, f"image {index + 1}, {name}", "pair") for name, image in shown.items())
         figures.append(f"<figure>{pictures}<figcaption>{' | '.join(shown)}</figcaption></figure>")
     parts = [

@@ -46,7 +46,7 @@ class Score:
 
     Attributes:
         images, labels: Numbers of images and of annotated stalks.
-        finds, right: Numbers of detections with a score of at least `MIN_SCORE`, and of true positives among them.
+        detections, true_positives: Numbers of detections with a score of at least `MIN_SCORE`, and of true ones among them.
         precision, recall, f1: Metrics of these detections; NaN if the denominator is 0.
         ap50: Average precision of all detections at an intersection over union of 0.5; NaN without labels.
         soft: Soft F1, 2 x (sum of the scores of true positives) / (sum of all scores + labels), which is continuous in the
@@ -55,8 +55,8 @@ class Score:
 
     images: int
     labels: int
-    finds: int
-    right: int
+    detections: int
+    true_positives: int
     precision: float
     recall: float
     f1: float
@@ -79,15 +79,15 @@ def detect_in_examples(
     Returns:
         Detections down to `Settings.min_score` in each image, in the same order.
     """
-    finds = []
+    detections = []
     for example in examples:
         image = batch_images([example], shape)[0][0]
         there = jax.device_get(detect(params, image, settings, dtype))
         stalks, scores = there.stalks[there.valid], there.scores[there.valid]
         truth, kinds = true_targets(example, shape, settings)
         matched = match_to_annotations(stalks, scores, truth, kinds)
-        finds.append(ImageDetections(stalks, scores, *matched, int((kinds == STALK).sum())))
-    return finds
+        detections.append(ImageDetections(stalks, scores, *matched, int((kinds == STALK).sum())))
+    return detections
 
 
 def true_targets(example: Example, shape: tuple[int, int], settings: Settings) -> tuple[np.ndarray, np.ndarray]:
@@ -121,13 +121,13 @@ def match_to_annotations(
         True positives [K] bool, and detections of unclear stalks, which are ignored [K] bool.
     """
     clear, unclear = truth[kinds == STALK], truth[kinds == UNCLEAR]
-    right, free = np.zeros(len(stalks), bool), np.ones(len(clear), bool)
+    is_correct, free = np.zeros(len(stalks), bool), np.ones(len(clear), bool)
     for place in np.argsort(-scores, kind="stable"):
         fitting = np.where(free, iou_with_boxes(stalks[place, :4], clear[:, :4]), 0.0)
         if fitting.size and fitting.max() >= IOU:
-            right[place], free[int(fitting.argmax())] = True, False
+            is_correct[place], free[int(fitting.argmax())] = True, False
     on_unclear = np.array([bool((iou_with_boxes(stalk[:4], unclear[:, :4]) >= IOU).any()) for stalk in stalks], bool)
-    return right, on_unclear & ~right
+    return is_correct, on_unclear & ~is_correct
 
 
 def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, dtype: Any) -> float:
@@ -155,18 +155,18 @@ def score_detections(detections: Sequence[ImageDetections]) -> Score:
     """Compute the metrics of the detections in several images, pooled; ignored detections are left out."""
     labels = sum(image.labels for image in detections)
     scores = np.concatenate([image.scores[~image.ignored] for image in detections] or [np.zeros(0)])
-    right = np.concatenate([image.is_correct[~image.ignored] for image in detections] or [np.zeros(0, bool)])
+    is_correct = np.concatenate([image.is_correct[~image.ignored] for image in detections] or [np.zeros(0, bool)])
     counted = scores >= MIN_SCORE
-    hits, count = int(right[counted].sum()), int(counted.sum())
+    hits, count = int(is_correct[counted].sum()), int(counted.sum())
     nothing = float("nan")
     return Score(
         images=len(detections),
         labels=labels,
-        finds=count,
-        right=hits,
+        detections=count,
+        true_positives=hits,
         precision=hits / count if count else nothing,
         recall=hits / labels if labels else nothing,
         f1=2.0 * hits / (count + labels) if count + labels else nothing,
-        ap50=average_precision(np.stack([scores, right], axis=1), labels) if labels else nothing,
-        soft=float(2.0 * scores[right].sum() / max(scores.sum() + labels, 1e-9)),
+        ap50=average_precision(np.stack([scores, is_correct], axis=1), labels) if labels else nothing,
+        soft=float(2.0 * scores[is_correct].sum() / max(scores.sum() + labels, 1e-9)),
     )
