@@ -10,7 +10,7 @@ import pytest
 
 from jaxrl_vis.stalks.phenotyping.io.images import read_disparity, read_image, write_image
 from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, encode_mask
-from jaxrl_vis.stalks.phenotyping.measure.diameter import diameter_mm, edge_tilt
+from jaxrl_vis.stalks.phenotyping.measure.diameter import diameter_mm, tilt_from_disparity
 from jaxrl_vis.stalks.phenotyping.measure.edges import refine_edges
 from jaxrl_vis.stalks.phenotyping.measure.ground import _fit_plane, find_ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import measure_stalk
@@ -187,7 +187,7 @@ def test_tilt_is_read_from_the_slope_of_disparity():
     lines = 0.0, higher[1] / higher[2] * CAMERAS.focal
     disparities = CAMERAS.disparity(np.array([depth, higher[2]]))
     slope = (disparities[1] - disparities[0]) / (lines[1] - lines[0])
-    assert edge_tilt(slope, disparities.mean(), CAMERAS) == pytest.approx(np.radians(10.0), rel=0.03)
+    assert tilt_from_disparity(slope, disparities.mean(), CAMERAS) == pytest.approx(np.radians(10.0), rel=0.03)
 
 
 # --- the ground ---

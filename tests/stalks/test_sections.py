@@ -11,7 +11,7 @@ from tiny_detector import TINY
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.anchors import encode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import roi_align, strip_half_width
-from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, covered, cut_chain, link
+from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, covered_fraction, cut_chain, link
 from jaxrl_vis.stalks.phenotyping.detector.detect import GRID, Settings, detect, init_detector, pool_regions
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, cut_to_band
@@ -212,7 +212,7 @@ def test_a_chain_is_cut_to_rows():
     axis = [50 + 16 * row / 32 for row in (40, 100)]
     np.testing.assert_allclose(cut_chain(chain, 40, 100), [axis[0] - 10, 40, axis[1] + 10, 100, *axis], atol=1e-4)
     assert best_rows(chain) == (32.0, 160.0)
-    assert covered(chain, 120, 200) == pytest.approx(0.5) and covered(chain, 170, 200) == 0.0
+    assert covered_fraction(chain, 120, 200) == pytest.approx(0.5) and covered_fraction(chain, 170, 200) == 0.0
     # Beyond its end, along its axis.
     np.testing.assert_allclose(cut_chain(chain, 128, 192)[4:], [114, 146], atol=1e-4)
 
@@ -280,7 +280,7 @@ def test_chains_of_true_sections_cut_to_the_band_are_the_true_boxes(plot):
     chains = link(targets[clear], np.ones(clear.sum(), np.float32), settings.section)
     boxes, missed = plot.stalks[plot.kinds == STALK], 0
     for box in boxes:
-        cuts = [cut_chain(chain, box[1], box[3]) for chain in chains if covered(chain, box[1], box[3]) > 0.7]
+        cuts = [cut_chain(chain, box[1], box[3]) for chain in chains if covered_fraction(chain, box[1], box[3]) > 0.7]
         missed += not any(np.abs(cut - box).max() < 1.5 and np.abs(cut - box).mean() < 0.6 for cut in cuts)
     assert len(boxes) > 5 and missed <= 1
 

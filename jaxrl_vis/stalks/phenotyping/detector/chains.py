@@ -117,7 +117,7 @@ def cut_chain(chain: Chain, top: float, bottom: float) -> np.ndarray:
     return np.array([(axis - half).min(), top, (axis + half).max(), bottom, axis[0], axis[-1]], np.float32)
 
 
-def covered(chain: Chain, top: float, bottom: float) -> float:
+def covered_fraction(chain: Chain, top: float, bottom: float) -> float:
     """Return the fraction of the rows from ``top`` to ``bottom`` that the sections of a chain cover."""
     low, high = np.maximum(chain.sections[:, 1], top), np.minimum(chain.sections[:, 3], bottom)
     return float(np.maximum(high - low, 0.0).sum() / max(bottom - top, 1e-6))

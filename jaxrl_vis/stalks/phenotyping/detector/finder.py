@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, covered, cut_chain, link
+from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, covered_fraction, cut_chain, link
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, pad_image
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.doubles import suppress_duplicates
@@ -292,7 +292,7 @@ def cut_to_band(chains: list[Chain], scale: tuple[float, float], band: Band | No
             column = float(np.median(chain.sections[:, 4:])) * scale[1] - 0.5
             top, bottom = band(column)
             rows = (top + 0.5) / scale[0], (bottom + 0.5) / scale[0]
-        if rows[1] - rows[0] > 1.0 and covered(chain, *rows) >= _COVERED:
+        if rows[1] - rows[0] > 1.0 and covered_fraction(chain, *rows) >= _COVERED:
             stalks.append(cut_chain(chain, *rows))
             scores.append(chain.score)
     return to_image_coordinates(np.array(stalks, np.float32).reshape(-1, 6), scale), np.array(scores, np.float32)

@@ -49,7 +49,7 @@ def diameter_mm(
     return 2e3 * float(np.linalg.norm(front)) * sine / (1.0 - sine)
 
 
-def edge_tilt(slope: float, disparity: float, calibration: Calibration) -> float:
+def tilt_from_disparity(slope: float, disparity: float, calibration: Calibration) -> float:
     """Compute the angle by which a stalk leans away from the camera, rad; 0 if the disparity is not positive.
 
     Args:

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.measure.diameter import diameter_mm, edge_tilt
+from jaxrl_vis.stalks.phenotyping.measure.diameter import diameter_mm, tilt_from_disparity
 from jaxrl_vis.stalks.phenotyping.measure.edges import refine_edges
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground
 from jaxrl_vis.stalks.phenotyping.measure.stereo import StalkDisparity, match_rows, sample_rows
@@ -213,5 +213,5 @@ def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -
         return 0.0
     first, second = index_pairs(matched.lines.size, 3)
     slopes = (matched.values[second] - matched.values[first]) / (matched.lines[second] - matched.lines[first])
-    tilt = edge_tilt(median(slopes), disparity, calibration)
+    tilt = tilt_from_disparity(median(slopes), disparity, calibration)
     return tilt if abs(tilt) < math.radians(30.0) else 0.0

@@ -30,10 +30,10 @@ class Gates:
         merge: Maximum distance along the row between two tracks of one stalk, which are merged.
         behind: The same for tracks of different depth, with the rays of one evaluated at the depth of the other.
         max_shared: Maximum fraction of the pairs of the shorter track in which both are seen, to merge them.
-        row: Maximum difference between the depth of a counted stalk and the median depth.
+        max_row_offset: Maximum difference between the depth of a counted stalk and the median depth.
         min_fraction: Minimum fraction of the pairs with the stalk in view that must show it to count it.
         min_pairs: Minimum number of pairs that must show it, unless fewer have it in view.
-        ends: Maximum distance of a counted stalk's foot beyond the ends of the path.
+        end_margin: Maximum distance of a counted stalk's foot beyond the ends of the path.
     """
 
     along: float = 0.018
@@ -41,10 +41,10 @@ class Gates:
     merge: float = 0.015
     behind: float = 0.005
     max_shared: float = 0.34
-    row: float = 0.2
+    max_row_offset: float = 0.2
     min_fraction: float = 0.3
     min_pairs: int = 2
-    ends: float = 0.01
+    end_margin: float = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -338,9 +338,9 @@ def _finish_track(
     begin, end = sorted((path.positions[0] - 0.5 * step, path.positions[-1] + 0.5 * step))
     if len(track.sightings) < wanted:
         reason = f"seen in {len(track.sightings)} of {expected} pairs"
-    elif known and abs(depth - usual) > gates.row:
+    elif known and abs(depth - usual) > gates.max_row_offset:
         reason = f"it stands {abs(depth - usual):.2f} m {'behind' if depth > usual else 'before'} the row"
-    elif not begin - gates.ends <= float(np.median(track.feet)) <= end + gates.ends:
+    elif not begin - gates.end_margin <= float(np.median(track.feet)) <= end + gates.end_margin:
         reason = "it stands beyond the ends of the path"
     else:
         reason = ""

@@ -101,7 +101,7 @@ def _interpolate(lines: np.ndarray, at: np.ndarray, values: np.ndarray) -> np.nd
     return inner
 
 
-def boxes_of(edges: np.ndarray) -> np.ndarray:
+def boxes_around_edges(edges: np.ndarray) -> np.ndarray:
     """Return the boxes [T, 4] float32 around the visible rows of edges [T, R, 3]; (0, 0, 0, 0) for stalks without such rows."""
     boxes = np.zeros((len(edges), 4), np.float32)
     for box, each in zip(boxes, edges):

@@ -14,7 +14,7 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 from jaxrl_vis.stalks.phenotyping.detector.finder import resize, upper_segment
 from jaxrl_vis.stalks.phenotyping.detector.sections import NOTHING, STALK, STEP, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut_crops
-from jaxrl_vis.stalks.phenotyping.training.edges import Edges, boxes_of, cut_edges, synthetic_edges
+from jaxrl_vis.stalks.phenotyping.training.edges import Edges, boxes_around_edges, cut_edges, synthetic_edges
 from jaxrl_vis_envs.plants import Calibration, Family, draw
 from jaxrl_vis_envs.plants.cameras import Pose
 from jaxrl_vis_envs.plants.field import Plot
@@ -135,7 +135,7 @@ def crop_randomly(example: Example, max_size: tuple[int, int], rng: np.random.Ge
     size = example.image.shape[:2]
     lines, columns = (min(length, limit) for length, limit in zip(size, max_size))
     low, high = np.zeros(2, int), np.array([size[0] - lines, size[1] - columns])
-    boxes = example.stalks if example.edges is None else boxes_of(example.edges[0])
+    boxes = example.stalks if example.edges is None else boxes_around_edges(example.edges[0])
     there = np.flatnonzero((example.kinds if example.edges is None else example.edges[1]) == STALK)
     if len(there) and rng.random() < _AT_STALKS:
         box = boxes[rng.choice(there)]
