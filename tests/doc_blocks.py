@@ -69,7 +69,7 @@ def commands(block: Block) -> Iterator[list[str]]:
                 yield words
 
 
-def check_other(words: list[str]) -> None:
+def check_command(words: list[str]) -> None:
     """Check that the targets, extras, modules, scripts and options named by a command other than `jaxrl-vis` exist."""
     program, *rest = words
     assert program in PROGRAMS, f"{program}: say here how to check it"

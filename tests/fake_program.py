@@ -185,7 +185,7 @@ def make_fake_trainer(
     return Trainer(config, FakeProgram(config, **program), run_dir, resume=resume, overwrite=overwrite, log=log)
 
 
-def interrupted_at(trainer: Trainer, iteration: int) -> None:
+def run_until_sigterm(trainer: Trainer, iteration: int) -> None:
     """Run a trainer, send SIGTERM after ``iteration``, and return once it has stopped; fail if it does not."""
     try:
         for report in trainer.run():

@@ -50,7 +50,7 @@ def train_iteration(program, loop):
     return program.learn(loop, _parts(program, program.play, loop.train, program.keys(loop.key, loop.iteration)))
 
 
-def experienced(program, key):
+def update_arguments(program, key):
     """Return arguments for ``program.update_many`` after one rollout; programs that differ only in updates share its code."""
     assert program.config.study.normalizer_source == "rollouts"
     what = type(program.env), _without(program.config, _LATER)

@@ -34,7 +34,7 @@ def backward(network: Layers, seen: list[np.ndarray], gradient: np.ndarray) -> t
     return found[::-1], gradient
 
 
-def followed(online: Layers, target: Layers, decay: float) -> Layers:
+def polyak_average(online: Layers, target: Layers, decay: float) -> Layers:
     """Return the target network after one update: decay * target + (1 - decay) * online."""
     return [tuple(decay * old + (1.0 - decay) * new for old, new in zip(*both)) for both in zip(target, online)]
 

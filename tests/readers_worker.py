@@ -33,13 +33,13 @@ class Outcome:
 
     Attributes:
         kind: ``value``, ``refused`` (one of the reader's own errors), or ``fault``.
-        past: True if the parser accepted the file.
+        parsed: True if the parser accepted the file.
         text: Message of the error; of a fault, the traceback.
         seconds, megabytes: CPU time, s, and peak memory, MB, of the call.
     """
 
     kind: str
-    past: bool
+    parsed: bool
     text: str = ""
     seconds: float = 0.0
     megabytes: float = 0.0
@@ -51,20 +51,20 @@ class Reader:
 
     Attributes:
         read: Function that reads the files in a folder, and checks the result.
-        past: Function that returns True if the parser accepts the files in a folder.
-        own: Errors that it may raise for bad files.
+        parsed: Function that returns True if the parser accepts the files in a folder.
+        expected_errors: Errors that it may raise for bad files.
     """
 
     read: Callable[[Path], Any]
-    past: Callable[[Path], bool]
-    own: tuple[type[Exception], ...]
+    parsed: Callable[[Path], bool]
+    expected_errors: tuple[type[Exception], ...]
 
 
 def call(reader: Reader, folder: Path) -> Outcome:
     """Call a reader in this process, and return the outcome."""
     import traceback
 
-    past = reader.past(folder)
+    parsed = reader.parsed(folder)
     before = _reset_peak()
     started = time.process_time()
     try:
@@ -72,16 +72,17 @@ def call(reader: Reader, folder: Path) -> Outcome:
         kind, text = "value", ""
     except BaseException as error:
         seconds = time.process_time() - started
-        own = type(error) in reader.own or isinstance(error, tuple(set(reader.own) - {ValueError}))
+        expected = reader.expected_errors
+        is_expected = type(error) in expected or isinstance(error, tuple(set(expected) - {ValueError}))
         text = str(error)
-        kind = "refused" if own else "fault"
-        if own and (len(text.splitlines()) != 1 or len(text) > 2000):
+        kind = "refused" if is_expected else "fault"
+        if is_expected and (len(text.splitlines()) != 1 or len(text) > 2000):
             kind, text = "fault", f"not one line: {text[:300]!r}"
-        elif not own:
+        elif not is_expected:
             text = traceback.format_exc()[-3000:]
     else:
         seconds = time.process_time() - started
-    return Outcome(kind, past, text, seconds, max(_peak() - before, 0.0))
+    return Outcome(kind, parsed, text, seconds, max(_peak() - before, 0.0))
 
 
 def _reset_peak() -> float:
@@ -155,10 +156,10 @@ class Worker:
         code = process.wait()
         self._process = None
         said = (self._folder / "stderr").read_bytes()[-2000:].decode(errors="replace")
-        past = not (self._folder / "loading").exists()
+        parsed = not (self._folder / "loading").exists()
         why = "hung" if code == -signal.SIGALRM else f"ended with {code}"
         # What MuJoCo's own parser does is not ours.
-        return Outcome("fault" if past else "refused", past, f"the process {why}: {said}")
+        return Outcome("fault" if parsed else "refused", parsed, f"the process {why}: {said}")
 
 
 def serve(folder: Path) -> None:

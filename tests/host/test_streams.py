@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from fake_program import interrupted_at, make_fake_trainer, rows_without_time, small_config
+from fake_program import make_fake_trainer, rows_without_time, run_until_sigterm, small_config
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import StorageError
@@ -237,7 +237,7 @@ def test_advice_after_a_fault_of_the_disk_can_be_followed(tmp_path, monkeypatch,
 
 def test_a_resumed_run_that_owes_an_evaluation_promises_no_speed(tmp_path, capsys):
     path = tmp_path / "run"
-    interrupted_at(make_fake_trainer(small_config(), path), 3)
+    run_until_sigterm(make_fake_trainer(small_config(), path), 3)
     capsys.readouterr()
     list(make_fake_trainer(small_config(), path, resume=True).run())
     first, second, *_ = [line for line in capsys.readouterr().out.splitlines() if line.startswith("iteration ")]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import probe_environments as probes
-from learners import experienced
+from learners import update_arguments
 
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner.ddpg import adam
@@ -51,7 +51,7 @@ def test_a_learner_goes_on_where_it_stopped():
     for calls, updates in ((1, 4), (2, 2)):
         config = preset("debug", num_envs=4, batch_size=8, updates_per_iteration=updates, actor_interval=2)
         program = make_train_step(probes.GoWhereTold(), config)
-        train, *given = experienced(program, jax.random.key(0))
+        train, *given = update_arguments(program, jax.random.key(0))
         for _ in range(calls):
             train, _ = program.update_many(train, *given)
         states = train.agent.critic_optimizer, train.agent.actor_optimizer

@@ -8,7 +8,7 @@ import numpy as np
 import point_mass
 import probe_environments as probes
 import pytest
-from learners import begin, experienced, train_iteration
+from learners import begin, train_iteration, update_arguments
 
 from benchmarks.tasks import contrastive_forms
 from jaxrl_vis.config import preset, validate
@@ -236,5 +236,5 @@ def test_rewards_change_nothing():
     agents = []
     for positive in (0.0, 5.0):
         program = make_train_step(probes.GoWhereTold(), preset("debug", algorithm="contrastive", reward_positive=positive))
-        agents.append(jax.device_get(program.update_many(*experienced(program, jax.random.key(0)))[0]).agent)
+        agents.append(jax.device_get(program.update_many(*update_arguments(program, jax.random.key(0)))[0]).agent)
     jax.tree.map(np.testing.assert_array_equal, *agents)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import probe_environments as probes
 import pytest
-from learners import begin, experienced, iteration_of_one, train_iteration
+from learners import begin, iteration_of_one, train_iteration, update_arguments
 
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner.acting import rollout
@@ -184,7 +184,7 @@ def test_targets_follow_once_an_interval(interval, updates):
     config = preset("debug", num_envs=4, batch_size=8, target_update_interval=interval, target_decay=0.9)
     program = make_train_step(probes.GoWhereTold(), config.replace(updates_per_iteration=updates))
     first = jax.device_get(begin(program, KEYS).train.agent)
-    train = jax.device_get(program.update_many(*experienced(program, KEYS[0]))[0]).agent
+    train = jax.device_get(program.update_many(*update_arguments(program, KEYS[0]))[0]).agent
     moved = jax.tree.map(lambda new, old: bool(np.any(new != old)), train.target_critic, first.target_critic)
     assert any(jax.tree.leaves(moved)) == (updates >= interval)
     if interval == 1:  # and by how much: a tenth of the way to where the online network is
@@ -295,7 +295,7 @@ def test_a_shared_encoder_learns_nothing_from_the_actor():
     def critic_after(learning_rate):
         config = preset("debug", encoders="shared", actor_learning_rate=learning_rate, batch_size=8, updates_per_iteration=1)
         program = make_train_step(probes.SeenGoWhereTold(), config)
-        return jax.device_get(program.update_many(*experienced(program, KEYS[0]))[0]).agent
+        return jax.device_get(program.update_many(*update_arguments(program, KEYS[0]))[0]).agent
 
     slow, fast = critic_after(1e-5), critic_after(1e-1)
     jax.tree.map(np.testing.assert_array_equal, slow.critic, fast.critic)
@@ -307,7 +307,7 @@ def test_the_actor_steps_once_an_interval():
     counts = {}
     for interval in (1, 3):
         program = make_train_step(probes.GoWhereTold(), config.replace(actor_interval=interval))
-        train, metrics = program.update_many(*experienced(program, KEYS[0]))
+        train, metrics = program.update_many(*update_arguments(program, KEYS[0]))
         counts[interval] = tuple(
             int(moments[0].count[0]) for moments in (train.agent.actor_optimizer, train.agent.critic_optimizer)
         )
@@ -336,7 +336,7 @@ def test_goals_that_are_reached_already_give_way(method):
     for kept in (1.0, 0.25, 0.0):
         config = preset("debug", num_envs=16, batch_size=512, relabel_probability=1.0, trivial_goals=kept, method=method)
         program = make_train_step(Elsewhere(), config)
-        _, metrics = program.update_many(*experienced(program, KEYS[0]))
+        _, metrics = program.update_many(*update_arguments(program, KEYS[0]))
         shares[kept] = float(metrics["train/positive_share"][0])
     same = 1 / 16  # the other episode may be the same one
     assert shares[1.0] == 1.0 and shares[0.0] == pytest.approx(same, abs=0.05)

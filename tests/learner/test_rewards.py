@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learners import experienced
+from learners import update_arguments
 from test_ddpg import trained
 from test_indicator_rewards import StaysPut
 
@@ -110,7 +110,7 @@ def test_features_are_rewarded_by_their_cosine(tmp_path):
     own = features_method(encode)
     np.testing.assert_allclose(make_reward(config, own)(pair(reached, goal), reached, 1.0, 0.0), found, atol=1e-4)
     program = make_train_step(StaysPut(), config)
-    _, metrics = program.update_many(*experienced(program, jax.random.key(0)))
+    _, metrics = program.update_many(*update_arguments(program, jax.random.key(0)))
     assert 0.0 < metrics["train/positive_share"][0] < 1.0
 
 

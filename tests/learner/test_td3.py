@@ -6,7 +6,7 @@ import numpy as np
 import probe_environments as probes
 import pytest
 from learners import begin, train_iteration
-from numpy_networks import Adam, backward, followed, forward, layers
+from numpy_networks import Adam, backward, forward, layers, polyak_average
 
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner.algorithm import Batches, Setup
@@ -73,8 +73,8 @@ def numpy_td3(agent, batches, noise, resolved):
             critics[number] = of_critics[number].step(network, backward(network, seen, slope)[0])
         if gradient is not None:
             actor = of_actor.step(actor, gradient)
-            target_actor = followed(actor, target_actor, DECAY)
-            targets = [followed(online, network, DECAY) for online, network in zip(critics, targets, strict=True)]
+            target_actor = polyak_average(actor, target_actor, DECAY)
+            targets = [polyak_average(online, network, DECAY) for online, network in zip(critics, targets, strict=True)]
     return actor, critics, target_actor, targets
 
 

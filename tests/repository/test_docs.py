@@ -177,7 +177,7 @@ def test_shell_blocks_could_be_typed(page: Path, reader: Path) -> None:
         save_file(block)
         for words in doc_blocks.commands(block) if block.language == "sh" and not block.mark else ():
             if words[0] != "jaxrl-vis":
-                doc_blocks.check_other(words)
+                doc_blocks.check_command(words)
                 continue
             name, rest = (words[1], words[2:]) if words[1].startswith("-") else cli.split_command(words[1:])
             there = name != "eval" or Path(rest[0]).exists()  # a page may evaluate what it has trained

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import wandb
-from fake_program import interrupted_at, make_fake_trainer, small_config
+from fake_program import make_fake_trainer, run_until_sigterm, small_config
 from tensorboardX.proto import event_pb2
 from wandb.proto import wandb_internal_pb2
 
@@ -182,7 +182,7 @@ def test_nobody_waits_for_a_logger_for_ever(
 
 def test_a_signal_saves_first_and_closes_the_loggers(tmp_path: Path) -> None:
     path = tmp_path / "run"
-    interrupted_at(make_fake_trainer(small_config(env_steps=400), path, log=("tensorboard",)), 5)
+    run_until_sigterm(make_fake_trainer(small_config(env_steps=400), path, log=("tensorboard",)), 5)
     assert (path / "checkpoints" / "full").is_dir()
     assert_shown(path, 0, "eval/success")
 

@@ -4,7 +4,7 @@ import json
 import math
 
 import pytest
-from fake_program import interrupted_at, make_fake_trainer, rows_without_time, small_config
+from fake_program import make_fake_trainer, rows_without_time, run_until_sigterm, small_config
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.learning import curve
@@ -154,7 +154,7 @@ def test_everything_else_that_reads_rows_leaves_damaged_ones_out(tmp_path):
 
 def test_a_checkpoint_that_is_newer_than_the_rows_is_refused(tmp_path):
     path = tmp_path / "run"
-    interrupted_at(make_fake_trainer(small_config(), path), 6)
+    run_until_sigterm(make_fake_trainer(small_config(), path), 6)
     file = path / "metrics.jsonl"
     before = file.read_bytes()
     file.write_bytes(b"".join(before.splitlines(keepends=True)[:4]))

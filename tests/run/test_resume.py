@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_program import final_state, interrupted_at, make_fake_trainer, rows_without_time, small_config
+from fake_program import final_state, make_fake_trainer, rows_without_time, run_until_sigterm, small_config
 
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.run import loop
@@ -153,7 +153,7 @@ def test_an_earlier_run_outlives_a_new_one_that_cannot_be(straight, tmp_path):
 
 def interrupted(config, path, after: int) -> None:
     """A run that SIGTERM ends after iteration ``after``, with a light and a full checkpoint."""
-    interrupted_at(make_fake_trainer(config, path), after)
+    run_until_sigterm(make_fake_trainer(config, path), after)
 
 
 def test_a_stale_full_checkpoint_destroys_nothing(tmp_path, capsys):

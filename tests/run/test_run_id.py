@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from fake_program import FakeProgram, final_state, interrupted_at, make_fake_trainer, rows_without_time, small_config
+from fake_program import FakeProgram, final_state, make_fake_trainer, rows_without_time, run_until_sigterm, small_config
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError, StorageError
@@ -43,7 +43,7 @@ def test_everything_that_a_run_writes_carries_its_id(tmp_path):
 def test_a_new_run_does_not_go_on_with_an_old_ones_checkpoints(straight, tmp_path, capsys):
     """As where they could not be deleted: the new run is interrupted before it has come as far as they are."""
     path = tmp_path / "run"
-    interrupted_at(make_fake_trainer(small_config(), path), 2)
+    run_until_sigterm(make_fake_trainer(small_config(), path), 2)
     for tier in (LIGHT, FULL):  # later than its own
         shutil.copytree(straight[0] / "checkpoints" / tier, path / "checkpoints" / tier, dirs_exist_ok=True)
     (path / "metrics.jsonl").open("a").write((straight[0] / "metrics.jsonl").read_text())
@@ -62,7 +62,7 @@ def test_a_new_run_does_not_go_on_with_an_old_ones_checkpoints(straight, tmp_pat
 def test_starting_again_deletes_nothing_of_another_run(straight, tmp_path, capsys):
     path = tmp_path / "run"
     for repetition in range(2):
-        interrupted_at(make_fake_trainer(small_config(), path, overwrite=repetition > 0), 2)
+        run_until_sigterm(make_fake_trainer(small_config(), path, overwrite=repetition > 0), 2)
         for tier in (LIGHT, FULL):
             shutil.copytree(straight[0] / "checkpoints" / tier, path / "checkpoints" / tier, dirs_exist_ok=True)
         (path / "metrics.jsonl").open("a").write((straight[0] / "metrics.jsonl").read_text())
@@ -317,7 +317,7 @@ def test_what_a_thread_made_of_a_folder_that_was_moved_goes(tmp_path, contents, 
 
 def test_a_row_whose_id_has_a_wrong_bit_is_put_aside(straight, tmp_path, capsys):
     path = tmp_path / "run"
-    interrupted_at(make_fake_trainer(small_config(), path), 4)
+    run_until_sigterm(make_fake_trainer(small_config(), path), 4)
     file = path / "metrics.jsonl"
     *lines, last = file.read_text().splitlines(keepends=True)
     run_id = read_run_id(path)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_program import FakeProgram, interrupted_at, small_config
+from fake_program import FakeProgram, run_until_sigterm, small_config
 
 from jaxrl_vis import cli
 from jaxrl_vis.config import Config, config_from_dict
@@ -292,7 +292,7 @@ def test_a_run_that_lost_its_replay_is_verified_up_to_there_and_after_full_check
     assert report.is_equal and report.rows == 4
     assert any("after iteration 4 the run resumed from a light checkpoint" in line for line in report.unverified)
     assert any("of iterations 6 to 8: checked" in line for line in report.unverified)
-    interrupted_at(run_trainer(config.replace(env_steps=100), path, resume=True), 9)
+    run_until_sigterm(run_trainer(config.replace(env_steps=100), path, resume=True), 9)
     list(run_trainer(config.replace(env_steps=120, full_checkpoint_interval=2), path, resume=True).run())
     report = verified(path, iterations=12)
     assert report.is_equal and report.rows == 8  # iterations 10 and 12, too, from full/10
@@ -300,7 +300,7 @@ def test_a_run_that_lost_its_replay_is_verified_up_to_there_and_after_full_check
 
 def test_an_exactly_resumed_run_is_equal_whatever_its_interval_was(verified, run_trainer, tmp_path):
     path = tmp_path / "run"
-    interrupted_at(run_trainer(small_config(eval_interval=4), path), 4)
+    run_until_sigterm(run_trainer(small_config(eval_interval=4), path), 4)
     list(run_trainer(small_config(eval_interval=3, env_steps=90), path, resume=True).run())
     assert [row["iteration"] for row in rows_in(path)[::2]] == [4, 6, 9]
     report = verified(path, iterations=9)
