@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.soak.parts import Broken, RunProcess, kill_on_exit, list_checkpoints, read_rows
+from benchmarks.soak.run_process import Broken, RunProcess, kill_on_exit, list_checkpoints, read_rows
 
 TASK = """
 import dataclasses
@@ -300,7 +300,7 @@ class References:
 
 
 @dataclasses.dataclass(frozen=True)
-class Alone:
+class SeparateFault:
     """Fault with a folder of its own.
 
     Attributes:
@@ -313,29 +313,29 @@ class Alone:
     guarantee: str
 
 
-ALONE: dict[str, Alone] = {
-    "NaN on one of two seeds": Alone(
+SEPARATE_FAULTS: dict[str, SeparateFault] = {
+    "NaN on one of two seeds": SeparateFault(
         nan_on_one_seed, "exit status 4; names the seed, dumps the state, and resumes from the last valid checkpoint"
     ),
-    "killed run of a sweep": Alone(
+    "killed run of a sweep": SeparateFault(
         worker_of_a_study, "one-line message; others continue; a restart yields the rows of an undisturbed sweep"
     ),
-    "killed job of a sweep": Alone(job_of_a_study, "the same for runs that are submitit jobs"),
-    "killed worker of phenotype run": Alone(
+    "killed job of a sweep": SeparateFault(job_of_a_study, "the same for runs that are submitit jobs"),
+    "killed worker of phenotype run": SeparateFault(
         worker_of_phenotyping, "one-line message; a restart yields the tables of an undisturbed run"
     ),
-    "killed worker of grasp eval": Alone(worker_of_grasping, "one-line message; a restart yields undisturbed figures"),
+    "killed worker of grasp eval": SeparateFault(worker_of_grasping, "one-line message; a restart yields undisturbed figures"),
 }
 
 
 def strike_alone(name: str, folder: Path, rng: random.Random, references: References) -> bool:
-    """Inject a fault of `ALONE` in a new folder, which is then deleted; return False if the command finished first.
+    """Inject a fault of `SEPARATE_FAULTS` in a new folder, which is then deleted; return False if the command finished first.
 
     Raises:
         Broken: The command does not handle the fault; the folder is left.
     """
     try:
-        ALONE[name].strike(folder, rng, references)
+        SEPARATE_FAULTS[name].strike(folder, rng, references)
     except NotStruck:
         return False
     shutil.rmtree(folder, ignore_errors=True)

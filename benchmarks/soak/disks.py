@@ -75,11 +75,11 @@ def freezing_disk(folder: Path) -> Iterator[tuple[Path, Callable[[bool], bool]]]
     mounted = _run("mkfs.ext4", "-q", str(image)) and _run("mount", "-o", "loop", str(image), str(disk))
     is_frozen = False
 
-    def freeze(still: bool) -> bool:
+    def freeze(frozen: bool) -> bool:
         nonlocal is_frozen
-        if not mounted or not _run("fsfreeze", "-f" if still else "-u", str(disk)):
+        if not mounted or not _run("fsfreeze", "-f" if frozen else "-u", str(disk)):
             return False
-        is_frozen = still
+        is_frozen = frozen
         return True
 
     with _run_folder_on_disk(folder, disk, mounted) as there:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.soak.disks import freezing_disk, small_disk
-from benchmarks.soak.parts import Broken, RunProcess, environment, kill_on_exit, list_checkpoints, read_rows
+from benchmarks.soak.run_process import Broken, RunProcess, environment, kill_on_exit, list_checkpoints, read_rows
 
 SITE = Path(__file__).with_name("site")
 Strike = Callable[[Path, random.Random], int | None]
@@ -34,14 +34,14 @@ class Fault:
         strike: Function of the run folder and a random generator that injects the fault.
         guarantee: Guaranteed outcome, for the table.
         statuses: Permitted exit statuses of the process.
-        spoils: True if a row of metrics.jsonl, or the run itself, may be lost.
+        may_lose_rows: True if a row of metrics.jsonl, or the run itself, may be lost.
         goes_back: True if the run may resume from an older checkpoint than the newest; `strike` checks which one.
     """
 
     strike: Strike
     guarantee: str
     statuses: tuple[int, ...]
-    spoils: bool = False
+    may_lose_rows: bool = False
     goes_back: bool = False
 
 
@@ -340,7 +340,7 @@ FAULTS: dict[str, Fault] = {
         _bit_in_a_checkpoint, "detected, or without effect on the restored state", (143,), goes_back=True
     ),
     "bit flipped in metrics.jsonl": Fault(
-        _bit_in_metrics, "all other rows are kept; an unreadable row is quarantined with a message", (143,), spoils=True
+        _bit_in_metrics, "all other rows are kept; an unreadable row is quarantined with a message", (143,), may_lose_rows=True
     ),
     "folder moved": Fault(
         _move_folder(is_kept=True),

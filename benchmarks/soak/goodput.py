@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.soak.parts import Broken, RunProcess, kill_on_exit, read_rows
+from benchmarks.soak.run_process import Broken, RunProcess, kill_on_exit, read_rows
 from jaxrl_vis.run.goodput import account, read_processes
 
 _FOREVER = 10**9  # environment steps

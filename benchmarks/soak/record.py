@@ -9,11 +9,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self
 
-from benchmarks.soak.alone import ALONE
+from benchmarks.soak.alone import SEPARATE_FAULTS
 from benchmarks.soak.faults import FAULTS
 from jaxrl_vis.host import provenance
 
-GUARANTEES = {name: fault.guarantee for name, fault in (FAULTS | ALONE).items()}
+GUARANTEES = {name: fault.guarantee for name, fault in (FAULTS | SEPARATE_FAULTS).items()}
 
 
 def _machine() -> dict[str, Any]:

@@ -10,10 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.soak.alone import ALONE, References, strike_alone
+from benchmarks.soak.alone import SEPARATE_FAULTS, References, strike_alone
 from benchmarks.soak.faults import FAULTS
-from benchmarks.soak.parts import LAST, Broken, RunProcess, kill_on_exit, list_checkpoints, read_rows
 from benchmarks.soak.record import Record
+from benchmarks.soak.run_process import LAST, Broken, RunProcess, kill_on_exit, list_checkpoints, read_rows
 from jaxrl_vis.run.goodput import account, read_processes
 
 FAULTS_PER_RUN = 8
@@ -105,14 +105,14 @@ class Soak:
                 return
 
     def _strike_alone(self, folder: Path, rng: random.Random, faults: list[str]) -> bool:
-        fault = self._next_fault(ALONE)
+        fault = self._next_fault(SEPARATE_FAULTS)
         if fault is None:
             return False
         faults.append(fault)
         if strike_alone(fault, folder, rng, self._references):
             self._note_fault(folder.name, fault, "")
         else:
-            self._return_fault(ALONE, fault)
+            self._return_fault(SEPARATE_FAULTS, fault)
         return True
 
     def _strike_run(self, folder: Path, rng: random.Random, faults: list[str]) -> bool:
@@ -130,8 +130,8 @@ class Soak:
                 break
             if status not in FAULTS[fault].statuses:
                 raise Broken(f"status {status}: {LAST.lines[-4:]}")
-            spoilt |= FAULTS[fault].spoils
-            if folder.exists() and not (FAULTS[fault].spoils or FAULTS[fault].goes_back):
+            spoilt |= FAULTS[fault].may_lose_rows
+            if folder.exists() and not (FAULTS[fault].may_lose_rows or FAULTS[fault].goes_back):
                 self._check_nothing_lost(folder, before, good[-1][0] if good else 0)
             self._note_fault(folder.name, fault, f"status {status}")
         if not faults:  # the run finished before the first fault, or it is time to end

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.ledger import pages
 from benchmarks.ledger.markers import fill
-from benchmarks.soak import parts
+from benchmarks.soak import run_process
 from benchmarks.soak.record import GUARANTEES, Record, add_records
 from benchmarks.soak.soak import Soak
 
@@ -16,9 +16,9 @@ FAULTS, SEED = 2, 156  # SIGKILL during a save, then SIGTERM
 
 
 def test_a_minute_of_faults(tmp_path, monkeypatch):
-    options = list(parts.OPTIONS)
-    options[options.index("--env-steps") + 1] = str(80 * parts.STEPS)  # a third of a soak's runs
-    monkeypatch.setattr(parts, "OPTIONS", options)
+    options = list(run_process.OPTIONS)
+    options[options.index("--env-steps") + 1] = str(80 * run_process.STEPS)  # a third of a soak's runs
+    monkeypatch.setattr(run_process, "OPTIONS", options)
     soak = Soak(tmp_path, FAULTS, SEED, math.inf, note=lambda record: None, alone=False)
     soak.train_reference()
     soak.work(0)

@@ -1,6 +1,6 @@
 """Measure the complexity of the source: sizes, imports, lists of option names, and calls from command line to critic loss.
 
-    python benchmarks/house.py [--json FILE] [--without-calls]
+    python benchmarks/complexity.py [--json FILE] [--without-calls]
 
 Calls are the frames of this project's own files in the traceback of an exception that is raised in ``critic_loss`` while
 ``jaxrl-vis train`` traces it. A list of option names is a tuple, list, set or dictionary with two or more names of
