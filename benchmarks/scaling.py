@@ -158,7 +158,7 @@ def all_reduce_seconds(numbers: int, devices: int) -> float:
     return statistics.median(seconds)
 
 
-def words(tree: Any) -> dict[str, bytes]:
+def leaf_bytes(tree: Any) -> dict[str, bytes]:
     """Return the bytes of all leaves of a loop state, by name."""
     plain = {
         name: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
@@ -178,13 +178,13 @@ def check_resume(saved: Timed, others: list[Config], env: Any, single: Timed) ->
         checkpoints = Checkpoints(Path(folder))
         start = time.perf_counter()
         checkpoints.save_full(1, saved.loop, {})
-        took, expected = time.perf_counter() - start, words(saved.loop)
+        took, expected = time.perf_counter() - start, leaf_bytes(saved.loop)
         lines.append(f"saved on {saved.config.run.devices} devices in {took:.1f} s, {len(expected)} arrays")
         for config in others:
             programs = single.programs if config.run.devices == 1 else Programs(config, make_train_step(env, config))
             restored = checkpoints.restore_for_resume(programs.shapes)
             assert restored is not None and restored.loop is not None and restored.tier == FULL
-            differing = [name for name, value in words(restored.loop).items() if value != expected[name]]
+            differing = [name for name, value in leaf_bytes(restored.loop).items() if value != expected[name]]
             if differing:
                 raise AssertionError(f"restored on {config.run.devices} devices, these differ: {', '.join(differing[:5])}")
             lines.append(f"restored on {config.run.devices}: all bit-equal")

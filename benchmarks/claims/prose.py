@@ -40,13 +40,13 @@ class Sentence:
         page: Page below the root.
         quote: Text with the computed numbers.
         record: Name of the record that they come from, for messages.
-        holds: True if the records support the text.
+        is_supported: True if the records support the text.
     """
 
     page: str
     quote: str
     record: str
-    holds: bool = True
+    is_supported: bool = True
 
 
 def plain(text: str) -> str:
@@ -62,7 +62,7 @@ def differences(sentences: Sequence[Sentence]) -> Iterator[str]:
     for sentence in sentences:
         if sentence.quote not in texts[sentence.page]:
             yield f"{sentence.page} does not say, as {sentence.record} does: {sentence.quote}"
-        if not sentence.holds:
+        if not sentence.is_supported:
             yield f"{sentence.page}: {sentence.record} does not say: {sentence.quote}"
     for page in OTHERS:
         text = texts[page]

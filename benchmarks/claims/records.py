@@ -105,8 +105,8 @@ def ablation(name: str) -> Record:
         KeyError: No curve has this name.
     """
     curve = _curves()[name]
-    made = frozenset({f"{curve.revision} on {curve.device}"} if curve.revision and curve.device else ())
-    return Record(f"ablations/{name}", tuple(row for row in curve.rows if SUCCESS in row), made)
+    origins = frozenset({f"{curve.revision} on {curve.device}"} if curve.revision and curve.device else ())
+    return Record(f"ablations/{name}", tuple(row for row in curve.rows if SUCCESS in row), origins)
 
 
 @functools.cache
@@ -114,9 +114,9 @@ def learning(*names: str) -> Record:
     """Return runs of benchmarks/results/learning, combined as seeds of one record."""
     folder, parts = RESULTS / "learning", []
     for name in names:
-        about = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-        made = frozenset({_format_origin(about["revision"], about["device"])})
-        parts.append(Record(f"learning/{name}", _evaluations(folder / f"{name}.metrics.jsonl"), made))
+        record = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+        origins = frozenset({_format_origin(record["revision"], record["device"])})
+        parts.append(Record(f"learning/{name}", _evaluations(folder / f"{name}.metrics.jsonl"), origins))
     return _merge_records(", ".join(part.name for part in parts), parts)
 
 
@@ -169,9 +169,9 @@ def _folders(family: str, stem: str) -> dict[int, Path]:
 
 @functools.cache
 def _read_run(folder: Path) -> Record:
-    about = read_record(folder)
-    made = frozenset({_format_origin(about["git_revision"], about["device"])})
-    return Record(folder.relative_to(RESULTS).as_posix(), _evaluations(folder / "metrics.jsonl"), made)
+    record = read_record(folder)
+    origins = frozenset({_format_origin(record["git_revision"], record["device"])})
+    return Record(folder.relative_to(RESULTS).as_posix(), _evaluations(folder / "metrics.jsonl"), origins)
 
 
 def _format_origin(revision: str, device: dict[str, Any]) -> str:

@@ -58,8 +58,8 @@ def _sum() -> Iterator[Sentence]:
         conjunction = "and" if verdict == "better" else "as well as"
         quote = f"on {place} {verdict} than none {none} {conjunction}"
         quote += f" worse than balancing {balance} and OL-AUX-5 {ours}" if verdict == "better" else f" than balancing {balance}"
-        holds = [c.verdict(plain, other, budget) for other in others] == [verdict, "worse", "worse"]
-        yield Sentence(LAB, quote, plain.name, holds)
+        is_supported = [c.verdict(plain, other, budget) for other in others] == [verdict, "worse", "worse"]
+        yield Sentence(LAB, quote, plain.name, is_supported)
 
 
 def _release() -> Iterator[Sentence]:
@@ -67,8 +67,8 @@ def _release() -> Iterator[Sentence]:
     budget, ours = ol_aux.BUDGETS[FETCH], others[-1]
     p = [f"({_p(release, other, budget)})" for other in others]
     quote = f"on FetchReach level with none {p[0]}, and worse than balancing {p[1]} and OL-AUX-5 {p[2]}."
-    holds = [c.verdict(release, other, budget) for other in others] == ["level", "worse", "worse"]
-    yield Sentence(LAB, quote, release.name, holds)
+    is_supported = [c.verdict(release, other, budget) for other in others] == ["level", "worse", "worse"]
+    yield Sentence(LAB, quote, release.name, is_supported)
     ends = [record.median(metric="train/weight/inverse_dynamics") for record in (release, ours)]
     quote = "that of inverse dynamics is {:,.0f} at the end, and {:.0f} with ours (medians)".format(*ends)
     yield Sentence(LAB, quote, release.name)
@@ -174,8 +174,8 @@ def _single_tasks() -> Iterator[Sentence]:
         f"OL-AUX-1 stays level on FetchReach ({_p(one, fresh, budget)}), and the ablation is worse there "
         f"({_p(ablated, fresh, budget)})"
     )
-    holds = [c.verdict(record, fresh, budget) for record in (one, ablated)] == ["level", "worse"]
-    yield Sentence(LAB, quote, ablated.name, holds)
+    is_supported = [c.verdict(record, fresh, budget) for record in (one, ablated)] == ["level", "worse"]
+    yield Sentence(LAB, quote, ablated.name, is_supported)
 
 
 def _indicator() -> Iterator[Sentence]:
@@ -282,8 +282,8 @@ def _choices() -> Iterator[Sentence]:
         "better than none on all three tasks. OL-AUX-5 is better on the hand and on par on the other two within these budgets"
     )
     by_task = dict(zip(tasks, against["ol_aux_5"], strict=True))
-    holds = against["none"] == ["better"] * 3 and by_task == {FETCH: "level", HAND: "worse", FINGER: "level"}
-    yield Sentence(GUIDE, quote, claim(HAND, "balance").name, holds)
+    is_supported = against["none"] == ["better"] * 3 and by_task == {FETCH: "level", HAND: "worse", FINGER: "level"}
+    yield Sentence(GUIDE, quote, claim(HAND, "balance").name, is_supported)
     quote = "over 2 M steps it is better than balancing on the hand"
     long = [claim(HAND, name, 2_000_000) for name in ("ol_aux_5", "balance")]
     yield Sentence(GUIDE, quote, long[0].name, c.verdict(*long, 2_000_000) == "better")
@@ -310,8 +310,8 @@ def _fast() -> Iterator[Sentence]:
     rest = ("none", "sum", "fixed_01", "fixed_1", "fixed_10")
     hand = ablation("hand_fast_ol_aux_5")
     quote = "OL-AUX-5 is better than every fixed weight that was tried, than the plain sum and than none"
-    holds = all(c.verdict(hand, ablation(f"hand_fast_{name}"), 300_000) == "better" for name in rest)
-    yield Sentence(FAST, quote, hand.name, holds)
+    is_supported = all(c.verdict(hand, ablation(f"hand_fast_{name}"), 300_000) == "better" for name in rest)
+    yield Sentence(FAST, quote, hand.name, is_supported)
     finger = ablation("finger_fast_ol_aux_5")
     verdicts = {name: c.verdict(finger, ablation(f"finger_fast_{name}"), 125_000) for name in rest}
     quote = "OL-AUX-5 is level with fixed weights of 10 and with the plain sum, and better than the others"

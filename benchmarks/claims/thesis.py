@@ -68,7 +68,7 @@ class Claim:
         interval: Intervals and p-values.
         source: Link to figure and table.
         records: Runs of the comparisons.
-        main: True if the README includes the claim.
+        in_readme: True if the README includes the claim.
     """
 
     claim: str
@@ -77,7 +77,7 @@ class Claim:
     interval: str
     source: str
     records: Sequence[Record]
-    main: bool = True
+    in_readme: bool = True
 
 
 def _ol_aux(first: str, second: str, tasks: Mapping[str, int]) -> list[Comparison]:
@@ -368,7 +368,7 @@ DETAILS = (_balance_and_none, _best_single_task, _ablation, _order, CLAIMS[-2])
 @functools.cache
 def claims() -> tuple[Claim, ...]:
     """Compute all claims."""
-    return tuple(dataclasses.replace(make(), main=make not in DETAILS) for make in CLAIMS)
+    return tuple(dataclasses.replace(make(), in_readme=make not in DETAILS) for make in CLAIMS)
 
 
 def _seeds(claim: Claim) -> str:
@@ -387,7 +387,7 @@ def _table() -> str:
 
 def _short() -> str:
     lines = ["| claim of the thesis | outcome | finding |", "|---|---|---|"]
-    lines += [f"| {row.claim} | {row.answer} | {row.finding} |" for row in claims() if row.main]
+    lines += [f"| {row.claim} | {row.answer} | {row.finding} |" for row in claims() if row.in_readme]
     return "\n".join([*lines, "", "Intervals, p-values, seeds and figures: [Claims of the thesis](docs/claims.md)."])
 
 

@@ -27,7 +27,7 @@ class Rate:
         config: Required entries of both configurations.
         device: Column of the speed table.
         unit: Unit of the rate, without "per second".
-        other: Name of the peer.
+        peer_name: Name of the peer.
     """
 
     label: str
@@ -36,7 +36,7 @@ class Rate:
     config: dict[str, Any]
     device: str
     unit: str
-    other: str
+    peer_name: str
 
 
 _IMAGE = {"image_size": 64, "pixels": "rgbd"}
@@ -84,7 +84,7 @@ def _rate_cells(row: Rate, records: list[dict[str, Any]]) -> tuple[str, str, str
     if ours is None:
         return None
     rates = [f"{format_short(record['value'])} {row.unit}/s" for record in (ours, theirs)]
-    return rates[0], f"{row.other}: {rates[1]}", f"{theirs['details']['ours_over_peer']:.3g} times"
+    return rates[0], f"{row.peer_name}: {rates[1]}", f"{theirs['details']['ours_over_peer']:.3g} times"
 
 
 def _learning_cells(results: Path) -> tuple[str, str, str] | None:

@@ -240,14 +240,14 @@ class _Peer:
         precise = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
         torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
         for choice in choices:
-            turns = learner.turns()
+            next_updates = learner.next_updates()
             critic_error, policy_loss, critic, actor = learner.gradients(choice)
             losses.append([float(critic_error), float(policy_loss)])
             for network, gradients in (("critic", critic), ("actor", actor)):
                 name = COMPARED_LAYER[network]
                 slope = self._module.layout.to_ours(name, gradients[name], encoder)
                 slopes.setdefault(network, slope.cpu().numpy())
-            learner.apply(critic, actor if turns[0] else {}, turns[1])
+            learner.apply(critic, actor if next_updates[0] else {}, next_updates[1])
         torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = precise
         return compare(self.reference, np.asarray(losses), slopes)
 

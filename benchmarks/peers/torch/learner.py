@@ -1,7 +1,7 @@
 """PyTorch implementation of `jaxrl_vis.learner`'s learner, optimised for speed; `comparison` measures it.
 
     Learner.step    gather -> normalise -> losses -> gradients -> Adam -> target networks, compiled as one function; target
-                    networks that are updated less often than every step are updated by a second one, `Learner.follow`
+                    networks that are updated less often than every step are updated by a second one, `Learner.update_targets`
     Compiled()      sample the batches of all steps, then run them one by one: on a GPU, replay one CUDA graph per step
 
 Parameters are float32 tensors by name ("encoder/kernel_0", "head/output/bias"); large kernels have a copy in the compute
@@ -138,7 +138,7 @@ class Learner:
             tuple(layout.to_layout(plane.to(device), rules.encoder, rules.levels) for plane in pair) for pair in statistics
         ]
         self.losses = torch.zeros(2, device=device)
-        self.updates = 0  # on the host: it decides the turns of the next step
+        self.updates = 0  # on the host: it decides what the next step updates
 
     def _is_copied(self, name: str, leaf: Any) -> bool:
         """Return True for a parameter with a copy in the compute dtype: the large kernels except those of the last layer."""
@@ -281,9 +281,9 @@ class Learner:
         if actor:
             self._adam("actor", actor, self.rules.actor_learning_rate)
         if with_targets:
-            self.follow()
+            self.update_targets()
 
-    def follow(self) -> None:
+    def update_targets(self) -> None:
         """Update the target networks: exponential moving average of the online networks."""
         for network in ("critic", "actor"):
             target = self.networks[f"target_{network}"]
@@ -312,20 +312,20 @@ class Learner:
         if copies:
             torch._foreach_copy_(list(copies.values()), [self.networks[network][name] for name in copies])
 
-    def step(self, choices: Any, cursor: Any, turns: tuple[bool, bool]) -> None:
+    def step(self, choices: Any, cursor: Any, next_updates: tuple[bool, bool]) -> None:
         """Take one gradient step and write its losses to ``losses``.
 
         Args:
             choices: Batches [steps, 3, B] int64, see `draw`.
             cursor: Index of the step, [1] int64; incremented in place.
-            turns: Flags for the actor's turn and the target networks' turn.
+            next_updates: Flags for the actor's turn and the target networks' turn.
         """
-        critic_error, policy_loss, critic, actor = self.gradients(choices.index_select(0, cursor)[0], turns[0])
-        self.apply(critic, actor, turns[1])
+        critic_error, policy_loss, critic, actor = self.gradients(choices.index_select(0, cursor)[0], next_updates[0])
+        self.apply(critic, actor, next_updates[1])
         self.losses.copy_(torch.stack([critic_error, policy_loss]))
         cursor.add_(1)
 
-    def turns(self) -> tuple[bool, bool]:
+    def next_updates(self) -> tuple[bool, bool]:
         """Return the flags of the next step for the actor and the target networks, and count the step."""
         self.updates += 1
         return self.updates % self.rules.actor_interval == 0, self.updates % self.rules.target_update_interval == 0
@@ -347,17 +347,17 @@ class Compiled:
         # The graphs are captured here and not by PyTorch, which skips steps that change their inputs.
         mode = "max-autotune-no-cudagraphs" if on_gpu else None
         compile_ = functools.partial(torch.compile, fullgraph=True, dynamic=False, mode=mode)
-        step, follow = compile_(learner.step), compile_(learner.follow)
+        step, update_targets = compile_(learner.step), compile_(learner.update_targets)
         # Infrequent updates of target networks run after the step, which would otherwise be compiled twice.
         at_every_step = learner.rules.target_update_interval == 1
         interval = math.lcm(learner.rules.actor_interval, learner.rules.target_update_interval)
         self._calls: dict[tuple[bool, bool], Callable[[], None]] = {}
-        for with_actor, with_targets in {learner.turns() for _ in range(interval)}:
+        for with_actor, with_targets in {learner.next_updates() for _ in range(interval)}:
 
             def call(with_actor: bool = with_actor, with_targets: bool = with_targets) -> None:
                 step(self._choices, self._cursor, (with_actor, at_every_step))
                 if with_targets and not at_every_step:
-                    follow()
+                    update_targets()
 
             call()
             self._calls[with_actor, with_targets] = self._capture_graph(call) if on_gpu else call
@@ -380,5 +380,5 @@ class Compiled:
         self._choices.copy_(self.learner.draw(self.steps))
         self._cursor.zero_()
         for _ in range(self.steps):
-            self._calls[self.learner.turns()]()
+            self._calls[self.learner.next_updates()]()
         return self.learner.losses
