@@ -51,7 +51,7 @@ class PointMass(MjxGoalEnv):
     action_size, camera, control_period = 2, "above", 0.05
 
     def __init__(self, config: PointMassConfig):
-        self._still = mjx_model.still_data(mujoco.MjModel.from_xml_string(XML))
+        self._rest = mjx_model.rest_data(mujoco.MjModel.from_xml_string(XML))
         super().__init__(config, mujoco.MjModel.from_xml_string(XML), self._observer(config))
 
     def _observer(self, config: PointMassConfig) -> Any:
@@ -73,7 +73,7 @@ class PointMass(MjxGoalEnv):
         return data.qpos
 
     def configuration(self, qpos: jax.Array) -> Any:
-        return mjx_model.mjx.kinematics(self._model, self._still.replace(qpos=qpos))
+        return mjx_model.mjx.kinematics(self._model, self._rest.replace(qpos=qpos))
 
 
 class StatePointMass(PointMass):

@@ -51,7 +51,7 @@ def start_at(env: Any, qpos: Any, qvel: Any) -> State:
 
     Poses and derived quantities are valid only after the first `advance`.
     """
-    still = jax.device_get(mjx_model.still_data(env.mj_model))
+    still = jax.device_get(mjx_model.rest_data(env.mj_model))
     still = jax.tree.map(lambda leaf: np.tile(leaf, (len(qpos), *(1,) * leaf.ndim)), still)
     data = still.replace(qpos=np.asarray(qpos, np.float32), qvel=np.asarray(qvel, np.float32))
     begin = jaxrl_vis_envs.jit(jax.vmap(lambda data: env.state_at(data, jnp.zeros_like(env.achieved(data)))))

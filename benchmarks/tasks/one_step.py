@@ -151,7 +151,7 @@ def our_step(env: Any, visited: VisitedStates, iterations: Iterations) -> np.nda
     if iterations == "more":
         mj_model = copy.copy(mj_model)
         mj_model.opt.iterations, mj_model.opt.ls_iterations = MORE_ITERATIONS
-    model, still = mjx.put_model(mj_model), mjx_model.still_data(mj_model)
+    model, still = mjx.put_model(mj_model), mjx_model.rest_data(mj_model)
     exact = iterations == "more" or env.exact_contacts
 
     def step(visited: VisitedStates) -> jax.Array:

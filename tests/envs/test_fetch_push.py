@@ -97,7 +97,7 @@ def contacts_of_boxes() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Contacts [K, 7] in each pose, MuJoCo's and ours: position (m), normal, distance (m); in order."""
     mj_model = mujoco.MjModel.from_xml_string(TWO_BOXES)
     mj_data, model = mujoco.MjData(mj_model), mjx.put_model(mj_model)
-    still = mjx_model.still_data(mj_model)
+    still = mjx_model.rest_data(mj_model)
 
     def ours(qpos):
         contact = box_contacts.collide(model, mjx_model.kinematics(model, still.replace(qpos=qpos)))._impl.contact

@@ -54,7 +54,7 @@ def assert_poses_agree(mj_model: mujoco.MjModel, names: tuple[str, ...]) -> None
     qpos = rng.uniform(-2, 2, (8, mj_model.nq)).astype(np.float32)
     mocap_pos = rng.uniform(-1, 1, (8, mj_model.nmocap, 3)).astype(np.float32)
     mocap_quat = rng.normal(size=(8, mj_model.nmocap, 4)).astype(np.float32)
-    model, still = mjx.put_model(mj_model), mjx_model.still_data(mj_model)
+    model, still = mjx.put_model(mj_model), mjx_model.rest_data(mj_model)
 
     @jaxrl_vis_envs.jit
     @jax.vmap

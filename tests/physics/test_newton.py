@@ -172,7 +172,7 @@ def test_without_warm_starts_the_last_accelerations_do_not_matter():
     mj_model = copy.copy(environments.make("Reacher").mj_model)
     mj_model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER  # four forward dynamics in a program take long to compile
     assert mj_model.opt.iterations == 1 and mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART
-    model, still = mjx.put_model(mj_model), mjx_model.still_data(mj_model)
+    model, still = mjx.put_model(mj_model), mjx_model.rest_data(mj_model)
     rng = np.random.default_rng(0)
     count = 32
     elbow = rng.choice([-1.0, 1.0], count) * rng.uniform(2.9, 3.1, count)

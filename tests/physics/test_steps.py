@@ -229,7 +229,7 @@ def test_on_a_cpu_the_finger_has_the_scalar_engine():
 
 def odd_states(mj_model: mujoco.MjModel, count: int) -> mjx.Data:
     rng = np.random.default_rng(4)
-    data = jax.tree.map(lambda leaf: jnp.tile(leaf, (count,) + (1,) * leaf.ndim), mjx_model.still_data(mj_model))
+    data = jax.tree.map(lambda leaf: jnp.tile(leaf, (count,) + (1,) * leaf.ndim), mjx_model.rest_data(mj_model))
     draw = {"qpos": 0.5, "qvel": 2.0, "qacc_warmstart": 10.0, "qfrc_applied": 1.0, "ctrl": 1.5}
     sizes = {name: getattr(data, name).shape for name in draw}
     return data.replace(**{name: jnp.asarray(rng.normal(0, draw[name], sizes[name]), jnp.float32) for name in draw})
@@ -267,7 +267,7 @@ def reacher_states(count: int) -> mjx.Data:
         "ctrl": rng.uniform(-1, 1, (count, 2)),
         "qfrc_applied": rng.normal(0, 5, (count, 2)),
     }
-    still = mjx_model.still_data(environments.make("Reacher").mj_model)
+    still = mjx_model.rest_data(environments.make("Reacher").mj_model)
     return jax.vmap(lambda varied: still.replace(**varied))({name: jnp.float32(value) for name, value in numbers.items()})
 
 
@@ -334,7 +334,7 @@ def test_joints_without_constraints_beside_others(integrator):
     </worldbody></mujoco>
     """
     mj_model = mujoco.MjModel.from_xml_string(xml)
-    model, still = mjx.put_model(mj_model), mjx_model.still_data(mj_model)
+    model, still = mjx.put_model(mj_model), mjx_model.rest_data(mj_model)
     assert scalar.supports(model)
     data = jax.vmap(lambda qpos: still.replace(qpos=qpos))(jnp.array([[0.0, 0.3], [0.2, -0.2]]))
     after = jaxrl_vis_envs.jit(jax.vmap(functools.partial(mjx_model.take_steps, model, count=3)))(data)

@@ -84,7 +84,7 @@ def odd_model() -> mujoco.MjModel:
 
 def odd_states(mj_model: mujoco.MjModel, count: int) -> mjx.Data:
     rng = np.random.default_rng(4)
-    data = jax.tree.map(lambda leaf: jnp.tile(leaf, (count,) + (1,) * leaf.ndim), mjx_model.still_data(mj_model))
+    data = jax.tree.map(lambda leaf: jnp.tile(leaf, (count,) + (1,) * leaf.ndim), mjx_model.rest_data(mj_model))
     draw = {"qpos": 0.5, "qvel": 2.0, "qacc_warmstart": 10.0, "qfrc_applied": 1.0, "mocap_pos": 0.2, "mocap_quat": 1.0}
     drawn = {name: rng.normal(0, draw[name], getattr(data, name).shape) for name in draw}
     drawn["mocap_pos"] += np.asarray(data.mocap_pos)

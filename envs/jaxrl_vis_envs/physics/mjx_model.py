@@ -23,10 +23,10 @@ __all__ = [
     "kinematics",
     "load_model",
     "mjx",
+    "rest_data",
     "simulate",
     "start_data",
     "step",
-    "still_data",
     "take_steps",
     "tip_jacobian",
 ]
@@ -60,7 +60,7 @@ def start_data(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> mjx.Data:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), data)
 
 
-def still_data(mj_model: mujoco.MjModel, keyframe: str | None = None) -> mjx.Data:
+def rest_data(mj_model: mujoco.MjModel, keyframe: str | None = None) -> mjx.Data:
     """Return `start_data` at a ``keyframe`` of the model, or, if None, at rest at its initial configuration."""
     mj_data = mujoco.MjData(mj_model)
     if keyframe is not None:

@@ -34,7 +34,7 @@ class ModelEnv:
     def __init__(self, mj_model: mujoco.MjModel, step: Callable[[Any, jax.Array], Any] | None = None) -> None:
         self.mj_model, self.mjx_model = mj_model, mjx_model.put_model(mj_model)
         self.action_size = mj_model.nu
-        self._start = mjx_model.still_data(mj_model)
+        self._start = mjx_model.rest_data(mj_model)
         self._step = step
 
     def reset(self, rng: jax.Array) -> State:

@@ -31,7 +31,7 @@ class Poses:
 
     def __init__(self, mj_model: mujoco.MjModel) -> None:
         self._model = mjx_model.put_model(mj_model)
-        self._data = mjx_model.still_data(mj_model)
+        self._data = mjx_model.rest_data(mj_model)
 
     def __call__(self, state: Any, model: Any = None) -> mjx.Data:
         """Compute the poses of one environment.

@@ -233,7 +233,7 @@ def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: bl
     shown = _declared_last(scene, view, rays, nearest, index) if outputs.segmentation and scene.reordered else index
     if outputs.rgb or outputs.depth or outputs.normals or outputs.distance or any(scene.transparent):
         row = lookup.fetch(view.table, index)
-        hit = surface.meet(scene, row, lookup.fetch_triangle(scene, nearest.triangle), rays, near)
+        hit = surface.intersect(scene, row, lookup.fetch_triangle(scene, nearest.triangle), rays, near)
         far = jnp.where(hit_mask, hit.depth, scene.zfar)
         normal = tuple(jnp.where(hit_mask, component, 0.0) for component in hit.normal)
         sheets = transparent.intersect_sheets(scene, view.unit, view.table, rays, far)

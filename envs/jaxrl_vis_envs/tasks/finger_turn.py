@@ -83,7 +83,7 @@ class FingerTurn(MjxGoalEnv):
         self.control_period = config.substeps * float(mj_model.opt.timestep)
         self._tip = mj_model.site("tip").id
         self._hinge = mj_model.body("spinner").id
-        self._still = mjx_model.still_data(mj_model)  # the finger hangs straight down
+        self._rest = mjx_model.rest_data(mj_model)  # the finger hangs straight down
         super().__init__(config, mj_model, observer)
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
@@ -94,13 +94,13 @@ class FingerTurn(MjxGoalEnv):
         candidates = jax.random.uniform(start_key, (_START_CANDIDATES, 3), jnp.float32, low, high)
         is_free = jax.vmap(lambda qpos: self._clearance(self.configuration(qpos)) > 0)(candidates)
         # Fallback if none is free: the finger hangs straight down, which is free at any angle of the spinner.
-        hanging = self._still.qpos.at[2].set(candidates[0, 2])
+        hanging = self._rest.qpos.at[2].set(candidates[0, 2])
         return self.configuration(jnp.where(jnp.any(is_free), candidates[jnp.argmax(is_free)], hanging))
 
     def sample_goal(self, key: jax.Array) -> mjx.Data:
         _, goal_key = jax.random.split(key)
         angle = jax.random.uniform(goal_key, (), jnp.float32, -jnp.pi, jnp.pi)
-        return self.configuration(self._still.qpos.at[2].set(angle))
+        return self.configuration(self._rest.qpos.at[2].set(angle))
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
         data = data.replace(ctrl=action)
@@ -115,7 +115,7 @@ class FingerTurn(MjxGoalEnv):
 
     def configuration(self, joint_angles: jax.Array) -> mjx.Data:
         """Return finger and spinner at rest with ``joint_angles`` [3] (rad): proximal (-pi/2 hangs down), distal, spinner."""
-        return mjx_model.kinematics(self._model, self._still.replace(qpos=joint_angles))
+        return mjx_model.kinematics(self._model, self._rest.replace(qpos=joint_angles))
 
     def _clearance(self, data: mjx.Data) -> jax.Array:
         """Return the minimum distance between finger and spinner, m; negative if they overlap."""

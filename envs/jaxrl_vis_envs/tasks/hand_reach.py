@@ -131,7 +131,7 @@ class HandReach(MjxGoalEnv):
                 mj_model.geom(name).size[0] = _FAINT_RADIUS
                 mj_model.geom(name.replace("tip", "distal")).rgba = _PLAIN
         self._tips = np.array([mj_model.site(name).id for name in _FINGERTIPS])
-        self._start = mjx_model.still_data(mj_model, "start")
+        self._start = mjx_model.rest_data(mj_model, "start")
         super().__init__(config, mj_model, observer)
         goal_model = mjx_model.load_model("hand_reach.xml")
         goal_model.opt = mj_model.opt

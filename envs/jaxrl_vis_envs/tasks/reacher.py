@@ -85,7 +85,7 @@ class Reacher(MjxGoalEnv):
         self._substeps = config.substeps or _DEFAULT_SUBSTEPS[config.control]
         self.control_period = self._substeps * float(mj_model.opt.timestep)
         self._fingertip = mj_model.site("fingertip").id
-        self._still = mjx_model.still_data(mj_model)
+        self._rest = mjx_model.rest_data(mj_model)
         super().__init__(config, mj_model, observer)
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
@@ -114,7 +114,7 @@ class Reacher(MjxGoalEnv):
 
     def configuration(self, joint_angles: jax.Array) -> mjx.Data:
         """Return the arm at rest with ``joint_angles`` [2] float32, rad."""
-        return mjx_model.kinematics(self._model, self._still.replace(qpos=joint_angles))
+        return mjx_model.kinematics(self._model, self._rest.replace(qpos=joint_angles))
 
 
 register_task(Reacher, ReacherConfig, VisualReacherConfig)

@@ -133,7 +133,7 @@ class StalkReach(MjxGoalEnv):
         self._layout = bending.read_layout(mj_model)
         self._wind = int(mj_model.body_mocapid[mj_model.body("wind").id])
         self._forearm = mj_model.body("forearm").id
-        self._still = mjx_model.still_data(mj_model)
+        self._rest = mjx_model.rest_data(mj_model)
         super().__init__(config, mj_model, observer)
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
@@ -171,9 +171,9 @@ class StalkReach(MjxGoalEnv):
         """Return the arm at rest with its grip at ``grip`` [3] (m, world), among stalks with ``displacement`` [N, 2] from rest,
         m.
         """
-        data = self._still.replace(
-            mocap_pos=self._still.mocap_pos.at[self._layout.mocap].set(episode.foot).at[self._wind].set(episode.wind),
-            mocap_quat=self._still.mocap_quat.at[self._layout.mocap].set(episode.rotation),
+        data = self._rest.replace(
+            mocap_pos=self._rest.mocap_pos.at[self._layout.mocap].set(episode.foot).at[self._wind].set(episode.wind),
+            mocap_quat=self._rest.mocap_quat.at[self._layout.mocap].set(episode.rotation),
         )
         hinges = bending.hinge_angles(self._layout, self.mj_model.nv, displacement)
         joints = stalk_arm.joints_at(grip, 1.0)

@@ -54,7 +54,7 @@ def operations_per_pixel(scene: Scene, tests: np.ndarray, coloured: bool = True)
     def finish(values: list[jax.Array], table: jax.Array, u: jax.Array, v: jax.Array, depth: jax.Array) -> Any:
         rays = Rays(u, v)
         row = lookup.make_row(values)
-        hit = surface.meet(scene, row, None, rays, depth)
+        hit = surface.intersect(scene, row, None, rays, depth)
         return hit.depth, shade.shade(scene, unit, lights.unpack(scene, table), row, hit, rays)
 
     table = jax.ShapeDtypeStruct((len(lights.facts(scene)), lights.COLUMNS), jnp.float32)

@@ -90,7 +90,7 @@ def _colour(
         pixel = triangles.kth(counts, ordinals)
         own = Rays(rays.u[pixel], rays.v[pixel])
         row, depth = lookup.fetch(table, owner[pixel]), jax.lax.bitcast_convert_type(near[pixel], jnp.float32)
-        hit = surface.meet(scene, row, lookup.fetch_triangle(scene, triangle[pixel]), own, depth)
+        hit = surface.intersect(scene, row, lookup.fetch_triangle(scene, triangle[pixel]), own, depth)
         return step + 1, plane.at[pixel].set(pack(shade.shade(scene, unit, unpacked, row, hit, own), colour_bits))
 
     start = (jnp.zeros((), jnp.int32), jnp.zeros_like(owner))

@@ -274,7 +274,7 @@ class _Colouring:
         """Return the visible object and the intersection at each pixel."""
         depth, index = raycast.decode(self.scene, inputs.key, inputs.row)
         row = _select_row(inputs.table, inputs.rows, index)
-        return row, surface.meet(self.scene, row, None, inputs.rays, depth, refined=False)
+        return row, surface.intersect(self.scene, row, None, inputs.rays, depth, refined=False)
 
     def _over_sky(self, inputs: _PassInputs, colour: Vector, sky: Vector) -> Vector:
         """Return ``colour`` at pixels that show an object, ``sky`` elsewhere."""

@@ -65,7 +65,7 @@ def face(
     # A face at the depth of an opaque surface, within a key's resolution, may be that surface, rendered twice.
     visible = (index == row) & ((own & ~raycast.code_mask(scene)) <= key)
     values = lookup.read_row(table[row])
-    hit = surface.meet(scene, values, None, rays, jnp.where(visible, depth, 1.0))
+    hit = surface.intersect(scene, values, None, rays, jnp.where(visible, depth, 1.0))
     colour, _ = transparent.face_colour(scene, unit, light_table, transparent.Sheet(row, values, hit, visible), rays)
     return pack(colour, BITS) | jnp.where(visible, _VISIBLE, 0)
 

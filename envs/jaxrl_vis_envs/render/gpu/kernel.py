@@ -2,8 +2,8 @@
 
 As XLA operations, every pixel would be tested against every object. Here, one program renders one tile of one image: it
 iterates over the objects by type, skips those whose bounding rectangle in the image misses the tile, and shades the nearest
-hits without leaving the chip. Per pixel, the code is the same as in plain JAX (`raycast.entry`, `surface.meet`, `shade.shade`),
-but reads scalars and blocks of memory instead of arrays.
+hits without leaving the chip. Per pixel, the code is the same as in plain JAX (`raycast.entry`, `surface.intersect`,
+`shade.shade`), but reads scalars and blocks of memory instead of arrays.
 """
 
 import functools
@@ -194,7 +194,7 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
 
         def surfaces():
             object_row = _fetch(refs, jnp.where(hit_mask, index, 0))
-            hit = surface.meet(inner, object_row, None, rays, near)
+            hit = surface.intersect(inner, object_row, None, rays, near)
             colour = (zero,) * 3
             if outputs.rgb:
                 colour = shade.shade(inner, None, lights.unpack(scene, refs.lights), object_row, hit, rays)
@@ -231,7 +231,7 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
 
 
 def _fetch(refs: _Refs, index: jax.Array) -> lookup.Row:
-    """Fetch the properties of each pixel's object that `surface.meet` and `shade.shade` need."""
+    """Fetch the properties of each pixel's object that `surface.intersect` and `shade.shade` need."""
     columns = [_column(refs.axes, index, i, j) for i in range(3) for j in range(3)]
     columns += [_column(refs.origin, index, i) for i in range(3)] + [_column(refs.extra, index)]
     return lookup.make_row(columns + [_column(refs.appearance, index, number) for number in range(refs.appearance.shape[1])])

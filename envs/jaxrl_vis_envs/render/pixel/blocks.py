@@ -161,7 +161,7 @@ def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> Nearest:
     if not scene.clusters.shape[-2]:
         return Nearest(key, row, None)
 
-    # Not differentiated: the derivatives come from `surface.meet`.
+    # Not differentiated: the derivatives come from `surface.intersect`.
     unit = jax.lax.stop_gradient(unit)
     bounds = jax.lax.optimization_barrier(triangles.opaque_bounds(jax.lax.stop_gradient(scene), unit))
 

@@ -31,7 +31,7 @@ class Hit(NamedTuple):
         gradient: Gradient of the surface in the frame of the unit shape.
         slope: Derivative of the surface's implicit function along the ray.
         normal: Unit normal in the camera's frame, outward (for a plane, towards the camera).
-        triangle: Triangle rows, as passed to `meet`.
+        triangle: Triangle rows, as passed to `intersect`.
     """
 
     depth: jax.Array
@@ -43,7 +43,7 @@ class Hit(NamedTuple):
     triangle: TriangleRow | None
 
 
-def meet(scene: Scene, row: Row, triangle: TriangleRow | None, rays: Rays, start: jax.Array, refined: bool = True) -> Hit:
+def intersect(scene: Scene, row: Row, triangle: TriangleRow | None, rays: Rays, start: jax.Array, refined: bool = True) -> Hit:
     """Intersect rays with the objects of ``row``, given an approximate depth.
 
     Args:

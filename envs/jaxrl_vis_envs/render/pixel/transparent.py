@@ -67,7 +67,9 @@ def intersect_sheets(scene: Scene, unit: shapes.UnitShapes, rows: jax.Array, ray
         row = lookup.read_row(rows[index])
         # A meaningless initial depth would cause NaN in gradients.
         t = jnp.where(visible, t, 1.0)
-        sheets.append(Sheet(index, row, surface.meet(scene, row, lookup.fetch_triangle(scene, triangle), rays, t), visible))
+        sheets.append(
+            Sheet(index, row, surface.intersect(scene, row, lookup.fetch_triangle(scene, triangle), rays, t), visible)
+        )
     return sheets
 
 
@@ -183,7 +185,7 @@ def _blend_next_face(
     film, (t, triangle) = state
     visible = triangle >= 0
     row = lookup.read_row(rows[index])
-    hit = surface.meet(scene, row, lookup.fetch_triangle(scene, triangle), rays, jnp.where(visible, t, 1.0))
+    hit = surface.intersect(scene, row, lookup.fetch_triangle(scene, triangle), rays, jnp.where(visible, t, 1.0))
     film = _add_face(film, *face_colour(scene, unit, light_table, Sheet(index, row, hit, visible), rays))
     # Pixels without a triangle get none in later steps either.
     after = jnp.where(visible, triangle, jnp.iinfo(jnp.int32).max - 1)

@@ -135,7 +135,7 @@ def build_arm_model(stalks: int) -> ArmModel:
     """Build the model of an arm among a number of ``stalks``; cached."""
     mj_model = stalk_arm.build(stalks)
     layout = bending.read_layout(mj_model)
-    rest = mjx_model.still_data(mj_model)
+    rest = mjx_model.rest_data(mj_model)
     model = mjx_model.put_model(mj_model)
     geoms = np.asarray(jax.jit(mjx.collision)(model, rest)._impl.contact.geom)
     places = {}
