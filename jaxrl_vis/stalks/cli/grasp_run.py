@@ -71,7 +71,7 @@ def run(options: Run) -> int:
         weights, name = resolve_weights(options.weights, options.masks)
         painter = load_painter(weights)
 
-        def find(image, folder, pair):
+        def find(image, plot, pair):
             return painter(image)
 
     known = {name: calibration for name, calibration in calibrations.items() if calibration is not None}
