@@ -99,9 +99,10 @@ def test_missing_pairs_and_missing_odometry_are_told_and_the_run_goes_on(runs, t
     assert first["pairs_skipped"] == "1" and "pairs skipped: 1" in first["flag"] and int(first["grasp_points"]) > 2
     assert second["flag"] == "no odometry: only the last pair was used" and int(second["grasp_points"]) > 2
     assert "skipped plot_0000/001: there is no right image" in capsys.readouterr().err
-    # Once they are back, the same command uses them.
+    # Once they are back, even under another name, the same command uses them.
     shutil.copy(runs / "plot_0000" / "right_001.png", folder / "plot_0000")
-    shutil.copy(runs / "plot_0001" / "odometry.csv", folder / "plot_0001")
+    text = (runs / "plot_0001" / "odometry.csv").read_text()
+    (folder / "plot_0001" / "odometry.txt").write_text(text.replace(",", "\t"))
     assert grasp(folder, tmp_path / "out") == 0
     assert [(row["flag"], row["pairs"], row["stitches"]) for row in table(tmp_path / "out" / "runs.csv")] == [
         ("ok", "3", "2")

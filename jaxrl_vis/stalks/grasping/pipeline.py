@@ -25,7 +25,7 @@ from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
 from jaxrl_vis.stalks.phenotyping.io.pair_reading import UnusablePairError, read_pair
-from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_file, read_odometries
 from jaxrl_vis.stalks.phenotyping.report.tables import Row, write_rows
 from jaxrl_vis.stalks.results_folder import claim_folder, file_state, is_current, pair_state, write_record
 from jaxrl_vis_envs.documents import read_json
@@ -146,9 +146,9 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
 
 
 def _sources(plot: PlotFolder) -> dict[str, Any]:
-    """Return the state of the files that the record of a run depends on: its odometry.csv and the files of each pair."""
+    """Return the state of the files that the record of a run depends on: its odometry and the files of each pair."""
     return {
-        "odometry": file_state(plot.folder / "odometry.csv"),
+        "odometry": file_state(odometry_file(plot.folder)),
         "pairs": {pair.name: pair_state(pair) for pair in plot.pairs},
     }
 
