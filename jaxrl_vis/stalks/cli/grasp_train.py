@@ -12,7 +12,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.host.worker_pool import map_unordered, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.stalks.cli.options import DEFAULT_STEPS, TrainingOptions, check_extra
+from jaxrl_vis.stalks.cli.options import DEFAULT_IMAGES, DEFAULT_STEPS, DEFAULT_WORKERS, TrainingOptions, check_extra
 
 _FIRST_SEED = 100_000
 """First seed of the training rows with --seed 0; lower seeds are for evaluation."""
@@ -44,7 +44,7 @@ def train(options: Train) -> int:
     check_extra("grasping")
     check_writable(options.out, "OUT")
     family = options.read_family("grasping")
-    if options.workers > 1:
+    if (options.workers or DEFAULT_WORKERS) > 1:
         share_accelerator()
     check_devices()
     enable_compilation_cache()
@@ -60,14 +60,15 @@ def _train(options: Train, family) -> int:
     first = _FIRST_SEED * (1 + options.seed)
     draw = functools.partial(synthetic_examples, family)
     sources: list[Iterator[Example]] = [
-        itertools.chain.from_iterable(map_unordered(draw, itertools.count(first), options.workers))
+        itertools.chain.from_iterable(map_unordered(draw, itertools.count(first), options.workers or DEFAULT_WORKERS))
     ]
     settings = Settings(options.loss)
+    images = options.images or DEFAULT_IMAGES
     plan = Plan(
         steps=options.steps or DEFAULT_STEPS,
         minutes=options.minutes,
-        images=options.images,
-        first=min(16, options.images),
+        images=images,
+        first=min(16, images),
         batch=options.batch,
         crop=options.crop,
         rate=options.rate or _RATES[options.loss],

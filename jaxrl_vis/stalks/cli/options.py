@@ -23,6 +23,10 @@ _COMMANDS = {"phenotyping": "phenotype", "grasping": "grasp"}
 Purpose = Literal["phenotyping", "grasping"]
 DEFAULT_STEPS = 20_000
 """Default maximum number of updates of a training on synthetic images."""
+DEFAULT_IMAGES = 800
+"""Default maximum number of synthetic images of a training."""
+DEFAULT_WORKERS = 4
+"""Default number of processes that render synthetic images."""
 BAND_WEIGHTS = "weights for stalks in the band; the backbone is kept, and the output layers start anew, for sections"
 """Note on weights that are trained further for other targets."""
 
@@ -137,16 +141,16 @@ class TrainingOptions(PlantOptions):
     With `phenotype train --data`, compilation and reading do not count, and the best weights so far are written."""
     steps: int | None = None
     """Maximum number of updates; if not given, 20,000, or 1,500 for `phenotype train --data`."""
-    images: int = 800
-    """Maximum number of synthetic training images; ignored with `phenotype train --data`."""
+    images: int | None = None
+    """Maximum number of synthetic training images; if not given, 800. Not with `phenotype train --data`."""
     batch: int = 16
     """Batch size in images or crops."""
     rate: float | None = None
     """Peak learning rate. If not given, 0.001, but 0.0004 for `grasp train --loss gan`, and 0.0003 if `phenotype train` starts
     from weights."""
-    workers: int = 4
-    """Number of processes that render synthetic images during training; with 1, a thread of the main process does. Ignored with
-    `phenotype train --data`."""
+    workers: int | None = None
+    """Number of processes that render synthetic images during training; with 1, a thread of the main process does. If not given,
+    4. Not with `phenotype train --data`."""
 
     def check(self) -> None:
         """Check the values of the options.

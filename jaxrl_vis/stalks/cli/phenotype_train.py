@@ -13,7 +13,14 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.host.worker_pool import map_unordered, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.stalks.cli.options import BAND_WEIGHTS, DEFAULT_STEPS, DetectorTraining, check_extra
+from jaxrl_vis.stalks.cli.options import (
+    BAND_WEIGHTS,
+    DEFAULT_IMAGES,
+    DEFAULT_STEPS,
+    DEFAULT_WORKERS,
+    DetectorTraining,
+    check_extra,
+)
 from jaxrl_vis.stalks.cli.tuning import train_on_images
 
 if TYPE_CHECKING:
@@ -32,11 +39,11 @@ def train(options: DetectorTraining) -> int:
     """
     check_counts(crops=options.crops)
     options.check()
-    drawn = (options.family, options.shift, options.spec, options.frames, options.width)
+    drawn = (options.family, options.shift, options.spec, options.frames, options.width, options.images, options.workers)
     if options.data is not None and any(drawn):
         raise RequestError(
-            "--data takes images of your own: leave out --spec and --width, --family, --shift and --frames, which describe "
-            "synthetic ones"
+            "--data takes images of your own: leave out --spec and --width, --family, --shift, --frames, --images and --workers, "
+            "which are for synthetic ones"
         )
     if options.label and options.data is None:
         raise RequestError("--label goes with --data: synthetic plots say themselves what is a stalk")
@@ -44,7 +51,7 @@ def train(options: DetectorTraining) -> int:
     check_writable(options.out, "OUT")
     if options.data is not None:
         return train_on_images(options, options.data)
-    if options.workers > 1:
+    if (options.workers or DEFAULT_WORKERS) > 1:
         share_accelerator()
     check_devices()
     enable_compilation_cache()
@@ -62,14 +69,15 @@ def _train(options: DetectorTraining) -> int:
     first = _FIRST_SEED * (1 + options.seed)
     draw = functools.partial(synthetic_examples, family, settings)
     sources: list[Iterator[Example]] = [
-        itertools.chain.from_iterable(map_unordered(draw, itertools.count(first), options.workers))
+        itertools.chain.from_iterable(map_unordered(draw, itertools.count(first), options.workers or DEFAULT_WORKERS))
     ]
     origin = f"synthetic plots of family {family.name}"
+    images = options.images or DEFAULT_IMAGES
     plan = Plan(
         steps=options.steps or DEFAULT_STEPS,
         minutes=options.minutes,
-        images=options.images,
-        first=min(24, options.images),
+        images=images,
+        first=min(24, images),
         batch=options.batch,
         crops=options.crops,
         rate=options.rate or (1e-3 if before is None else 3e-4),
