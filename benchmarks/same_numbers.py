@@ -86,13 +86,17 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     names = [name for name in RUNS if any(word in name for word in options.only)]
+    before = {} if options.compare is None else json.loads(options.compare.read_text())
+    missing = [name for name in names if name not in before]
+    if options.compare is not None and missing:
+        print(f"{options.compare} has no numbers of {', '.join(missing)}: write it with the same --only", file=sys.stderr)
+        return 2
     with tempfile.TemporaryDirectory() as folder, concurrent.futures.ThreadPoolExecutor(options.workers) as pool:
         numbers = dict(zip(names, pool.map(lambda name: train(name, Path(folder)), names), strict=True))
     if options.write is not None:
         options.write.write_text(json.dumps(numbers))
     if options.compare is None:
         return 0
-    before = json.loads(options.compare.read_text())
     unequal = {name: lines for name in names if (lines := differences(before[name], numbers[name]))}
     for name in names:
         print(f"{name:28} {'DIFFERS' if name in unequal else 'equal'} ({len(numbers[name])} rows)")
