@@ -149,8 +149,8 @@ class TrainingOptions(PlantOptions):
     """Peak learning rate. If not given, 0.001, but 0.0004 for `grasp train --loss gan`, and 0.0003 if `phenotype train` starts
     from weights."""
     workers: int | None = None
-    """Number of processes that render synthetic images during training; with 1, a thread of the main process does. If not given,
-    4. Not with `phenotype train --data`."""
+    """Number of processes that render synthetic images during training; with 1, a thread of the main process does. If not
+    given, 4. Not with `phenotype train --data`."""
 
     def check(self) -> None:
         """Check the values of the options.

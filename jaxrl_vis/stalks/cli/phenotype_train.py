@@ -42,8 +42,8 @@ def train(options: DetectorTraining) -> int:
     drawn = (options.family, options.shift, options.spec, options.frames, options.width, options.images, options.workers)
     if options.data is not None and any(drawn):
         raise RequestError(
-            "--data takes images of your own: leave out --spec and --width, --family, --shift, --frames, --images and --workers, "
-            "which are for synthetic ones"
+            "--data takes images of your own: leave out --spec and --width, --family, --shift, --frames, --images and "
+            "--workers, which are for synthetic ones"
         )
     if options.label and options.data is None:
         raise RequestError("--label goes with --data: synthetic plots say themselves what is a stalk")
