@@ -40,7 +40,8 @@ def trained(env, iterations=12, **overrides):
     loop = begin(program, jax.random.key(7)[None])
     for _ in range(iterations):
         loop, metrics = iterate(loop)
-    return program, jax.tree.map(lambda leaf: leaf[0], loop.train), metrics
+    # On the host: on a device each size of leaf would be a program to compile.
+    return program, jax.tree.map(lambda leaf: leaf[0], jax.device_get(loop.train)), metrics
 
 
 def values(program, train, observations, goals, action=0.0):
