@@ -274,6 +274,9 @@ def test_brax_environments_under_brax_wrappers(backend: str) -> None:
     wrapped = training.wrap(env, episode_length=1, action_repeat=1)
     first = jaxrl_vis_envs.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
     state = jaxrl_vis_envs.jit(wrapped.step)(first, jnp.ones((2, 1)))
+    # What a step returns can be stepped again.
+    again = jax.eval_shape(wrapped.step, state, jnp.ones((2, 1)))
+    assert jax.tree.map(jnp.shape, again) == jax.tree.map(jnp.shape, state)
     assert isinstance(state, brax.envs.State) and state.done.all()
     # The episode began anew, where the first one did.
     np.testing.assert_array_equal(state.obs["pixels/free"], first.obs["pixels/free"])
