@@ -1,14 +1,17 @@
 """Shared fixtures and hooks. Tests run on the CPU and share a persistent compilation cache across workers and runs."""
 
+import functools
 import gc
 import getpass
 import os
 import signal
 import sys
 import tempfile
+import zlib
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 # Read by JAX at its first import, so set before any test module is imported.
@@ -38,6 +41,7 @@ os.environ["XLA_FLAGS"] = " ".join(
 
 import hypothesis
 import jax
+import jax._src.compilation_cache
 import pytest
 
 # Test files share fixtures and small helpers across folders.
@@ -65,6 +69,11 @@ hypothesis.settings.register_profile(
     print_blob=True,
 )
 hypothesis.settings.load_profile("suite")
+
+# What JAX keeps of a program is read once or twice: to compress it well takes longer than that.
+jax._src.compilation_cache.zlib = SimpleNamespace(
+    compress=functools.partial(zlib.compress, level=1), decompress=zlib.decompress
+)
 
 # Tracing makes millions of small objects, few of them garbage: looked for as often as by default, it costs a tenth of it all.
 gc.set_threshold(100_000, 20, 20)

@@ -9,6 +9,7 @@ from jaxrl_vis.cli.task_images import TaskImages
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis.host.provenance import revision
 from jaxrl_vis.report.outputs import check_figure, check_writable
 
 
@@ -75,6 +76,7 @@ def run(options: Audit) -> int:
         print(options.out)
     if options.json is not None:
         asked = {key: value for key, value in dataclasses.asdict(options).items() if key not in ("out", "json", "trust")}
-        record = {"audit": asked, "device": report.device_kind(), "pairs": len(pairs.distance), "rewards": records}
+        origin = {"revision": revision(), "device": report.device_kind()}
+        record = {"audit": asked, **origin, "pairs": len(pairs.distance), "rewards": records}
         write_atomically(options.json, json.dumps(record, indent=2) + "\n")
     return 0

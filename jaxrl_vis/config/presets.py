@@ -166,6 +166,7 @@ TASKS: Mapping[tuple[str, str], TaskValues] = {
             "eval_episodes": 64,
             "relabel_probability": 0.8,
         },
+        images={"critic_states": True},
         oracle={"trivial_goals": 0.2},
     ),
     ("cpu", "Reacher"): TaskValues(images={"relabel_probability": 0.8}, images_and_oracle={"balance_probability": 0.3}),

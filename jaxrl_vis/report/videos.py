@@ -5,6 +5,7 @@ Images are planar, [C, H, W] uint8, and shown in rows: colour, then depth, as av
 
 import base64
 import dataclasses
+import functools
 import io
 import warnings
 from collections.abc import Sequence
@@ -85,9 +86,41 @@ def enlarge(image: np.ndarray, size: int = _IMAGE_SIZE) -> Image.Image:
     return Image.fromarray(image).resize(enlarged, Image.Resampling.NEAREST)
 
 
+@functools.cache
+def _font(size: int) -> Any:
+    return ImageFont.load_default(size=size)
+
+
+def _draw_backdrop(goal: np.ndarray, depth_range: tuple[float, float]) -> Image.Image:
+    """Draw what all frames of an episode have in common: captions, the goal [C, H, W] uint8, and the bar of elapsed time."""
+    images = [enlarge(wanted) for _, wanted in image_rows(goal, depth_range)]
+    width, height = images[0].size
+    cell = height + 2 * BORDER + GAP
+    size = (2 * (width + 2 * BORDER) + 3 * GAP, HEADER + GAP // 2 + cell * len(images) + FOOTER)
+    canvas = Image.new("RGB", size, BACKGROUND)
+    draw = ImageDraw.Draw(canvas)
+    columns = (GAP, 2 * GAP + width + 2 * BORDER)
+    for x, text in zip(columns, ("observation", "goal"), strict=True):
+        draw.text((x + 2, HEADER // 2 + 4), text, font=_font(17), fill=TEXT, anchor="lm")
+    for row, image in enumerate(images):
+        _paste(canvas, image, columns[1], row, PLAIN)
+    y = size[1] - FOOTER
+    draw.rectangle((GAP, y, size[0] - GAP, y + 3), fill=PLAIN)
+    return canvas
+
+
+def _paste(canvas: Image.Image, image: Image.Image, x: int, row: int, border: tuple[int, int, int]) -> None:
+    """Paste an image with a border into the column that begins at ``x`` px."""
+    width, height = image.size
+    y = HEADER + GAP // 2 + row * (height + 2 * BORDER + GAP)
+    outline = (x, y, x + width + 2 * BORDER - 1, y + height + 2 * BORDER - 1)
+    ImageDraw.Draw(canvas).rectangle(outline, fill=border)
+    canvas.paste(image, (x + BORDER, y + BORDER))
+
+
 def _compose(
+    backdrop: Image.Image,
     observation: np.ndarray,
-    goal: np.ndarray,
     depth_range: tuple[float, float],
     footer: tuple[str, str],
     fraction: float,
@@ -96,34 +129,21 @@ def _compose(
     """Compose one frame of the video.
 
     Args:
+        backdrop: See `_draw_backdrop`; it is not changed.
         observation: [C, H, W] uint8.
-        goal: [C, H, W] uint8.
         depth_range: See `range_of_depth`.
         footer: The texts at the left and at the right.
         fraction: Elapsed fraction of the episode, 0 to 1.
         colour: Colour of the border.
     """
-    left, right = (image_rows(image, depth_range) for image in (observation, goal))
-    images = [(enlarge(actual), enlarge(wanted)) for (_, actual), (_, wanted) in zip(left, right, strict=True)]
-    width, height = images[0][0].size
-    cell = height + 2 * BORDER + GAP
-    size = (2 * (width + 2 * BORDER) + 3 * GAP, HEADER + GAP // 2 + cell * len(images) + FOOTER)
-    canvas = Image.new("RGB", size, BACKGROUND)
-    draw = ImageDraw.Draw(canvas)
-    font, small = ImageFont.load_default(size=17), ImageFont.load_default(size=14)
-    columns = (GAP, 2 * GAP + width + 2 * BORDER)
-    for x, text in zip(columns, ("observation", "goal"), strict=True):
-        draw.text((x + 2, HEADER // 2 + 4), text, font=font, fill=TEXT, anchor="lm")
-    for row, pair in enumerate(images):
-        y = HEADER + GAP // 2 + row * cell
-        for x, image, border in zip(columns, pair, (colour, PLAIN), strict=True):
-            draw.rectangle((x, y, x + width + 2 * BORDER - 1, y + height + 2 * BORDER - 1), fill=border)
-            canvas.paste(image, (x + BORDER, y + BORDER))
-    y = size[1] - FOOTER
-    draw.rectangle((GAP, y, size[0] - GAP, y + 3), fill=PLAIN)
-    draw.rectangle((GAP, y, GAP + (size[0] - 2 * GAP) * fraction, y + 3), fill=colour if colour != PLAIN else FAINT)
-    draw.text((GAP + 2, y + 20), footer[0], font=small, fill=FAINT, anchor="lm")
-    draw.text((size[0] - GAP - 2, y + 20), footer[1], font=font, fill=colour if colour != PLAIN else FAINT, anchor="rm")
+    canvas = backdrop.copy()
+    for row, (_, actual) in enumerate(image_rows(observation, depth_range)):
+        _paste(canvas, enlarge(actual), GAP, row, colour)
+    draw, (width, height) = ImageDraw.Draw(canvas), canvas.size
+    y, shown = height - FOOTER, colour if colour != PLAIN else FAINT
+    draw.rectangle((GAP, y, GAP + (width - 2 * GAP) * fraction, y + 3), fill=shown)
+    draw.text((GAP + 2, y + 20), footer[0], font=_font(14), fill=FAINT, anchor="lm")
+    draw.text((width - GAP - 2, y + 20), footer[1], font=_font(17), fill=shown, anchor="rm")
     return canvas
 
 
@@ -143,6 +163,7 @@ def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int
     images, seconds = [], []
     for episode in range(count):
         success = np.asarray(episodes.success[episode], bool)
+        backdrop = _draw_backdrop(episodes.goals[episode], depth_range)
         for t in range(num_frames):
             is_last = t == num_frames - 1
             reached = bool(success[t]) if success.ndim else is_last and bool(success)
@@ -150,8 +171,7 @@ def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int
             verdict = "goal reached" if reached else "missed" if is_last else ""
             footer = (f"episode {episode + 1} of {count}   step {t} of {num_frames - 1}", verdict)
             fraction = t / max(1, num_frames - 1)
-            frame, goal = episodes.frames[episode, t], episodes.goals[episode]
-            images.append(_compose(frame, goal, depth_range, footer, fraction, colour))
+            images.append(_compose(backdrop, episodes.frames[episode, t], depth_range, footer, fraction, colour))
             seconds.append(HOLD if is_last else frame_seconds)
     return images, seconds
 

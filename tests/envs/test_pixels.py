@@ -271,12 +271,12 @@ def test_brax_environments_under_brax_wrappers(backend: str) -> None:
         "pixels/free": (SIZE, SIZE, 3),
         "pixels/free/goal": (SIZE, SIZE, 3),
     }
-    wrapped = training.wrap(env, episode_length=2, action_repeat=1)
-    state = jaxrl_vis_envs.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
-    first = state
-    step = jaxrl_vis_envs.jit(wrapped.step)
-    for _ in range(2):
-        state = step(state, jnp.ones((2, 1)))
+    wrapped = training.wrap(env, episode_length=1, action_repeat=1)
+    first = jaxrl_vis_envs.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
+    state = jaxrl_vis_envs.jit(wrapped.step)(first, jnp.ones((2, 1)))
+    # What a step returns can be stepped again.
+    again = jax.eval_shape(wrapped.step, state, jnp.ones((2, 1)))
+    assert jax.tree.map(jnp.shape, again) == jax.tree.map(jnp.shape, state)
     assert isinstance(state, brax.envs.State) and state.done.all()
     # The episode began anew, where the first one did.
     np.testing.assert_array_equal(state.obs["pixels/free"], first.obs["pixels/free"])
@@ -527,11 +527,14 @@ def test_images_of_wrapped_environments_equal_those_of_mujoco(name: str) -> None
     )
 
     @jaxrl_vis_envs.jit
-    @jax.vmap
-    def draw(qpos: jax.Array) -> Any:
-        return env.step(env.reset(jax.random.key(0)), qpos).obs
+    def draw(scenes: dict[str, Scene], qpos: jax.Array) -> Any:
+        # Scenes are an argument: megabytes of textures, which are constants otherwise, take longer to compile than the rest.
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(env.views, "scenes", scenes)
+            # One after the other: under `jax.vmap` as much again would have to be traced.
+            return jax.lax.map(lambda each: env.step(env.reset(jax.random.key(0)), each).obs, qpos)
 
-    images = jax.tree.map(np.asarray, draw(jnp.asarray(references.qpos, jnp.float32)))
+    images = jax.tree.map(np.asarray, draw(env.views.scenes, jnp.asarray(references.qpos, jnp.float32)))
     tally, prefix = Tally(surface_kinds(mj_model)), f"pixels/{model.camera}"
     for index in range(len(references.qpos)):
         colours = np.rint(255.0 * images[prefix][index]).astype(np.uint8)
@@ -551,7 +554,7 @@ def test_normals_are_those_of_the_depths_of_mujoco(name: str) -> None:
         mj_data.qpos[:] = qpos
         mujoco.mj_forward(mj_model, mj_data)
         poses.append(poses_of(mj_data))
-    draw = jaxrl_vis_envs.jit(jax.vmap(lambda arrays: views(SimpleNamespace(**arrays))[model.camera]))
+    draw = jaxrl_vis_envs.jit(lambda poses: jax.lax.map(lambda each: views(SimpleNamespace(**each))[model.camera], poses))
     ours = jax.tree.map(np.asarray, draw(jax.tree.map(lambda *rows: np.stack(rows), *poses)))
     scene = views.scenes[model.camera]
     points = np.stack([np.asarray(scene.points(depth), np.float64) for depth in references.depth]) * [1.0, -1.0, -1.0]

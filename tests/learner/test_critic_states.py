@@ -17,7 +17,7 @@ DISCOUNT = 0.75  # 1 - 1/horizon of the probes
 SETTINGS = {
     "num_envs": 16,
     "updates_per_iteration": 50,
-    "batch_size": 64,
+    "batch_size": 32,
     "hidden_sizes": (64, 64),
     "encoder_filters": (8, 8),
     "replay_transitions": 4000,
@@ -59,7 +59,7 @@ def trained(env, iterations, **overrides):
 
 def test_values_of_states_and_goals_that_no_image_shows():
     program, train, _ = trained(Dark(), 15, relabel_probability=0.0, algorithm="td3")
-    train, networks = jax.tree.map(lambda leaf: leaf[0], train), program.networks
+    train, networks = jax.tree.map(lambda leaf: leaf[0], jax.device_get(train)), program.networks
     states = jnp.array([[x, 1.0, goal] for goal in (0.0, 5.0) for x in (-3.0, -2.0, -1.0)])
     scaling = networks.scaling(train.state_normalizer)
     states = (states - scaling.mean) * scaling.scale

@@ -45,7 +45,7 @@ class StaysPut(probes.SeenGoWhereTold):
 
 @pytest.fixture(scope="module")
 def with_autoencoder():
-    return trained(StaysPut(), method="autoencoder", iterations=14)
+    return trained(StaysPut(), method="autoencoder", iterations=14, batch_size=32)
 
 
 def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):

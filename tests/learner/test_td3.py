@@ -133,7 +133,10 @@ SETTINGS = {
     ("env", "changes"),
     [
         (probes.GoWhereTold(), {"seeds": 2}),
-        (probes.SeenGoWhereTold(), {"encoder_filters": (8, 8), "normalizer_floor": 1.0, "encoders": "shared"}),
+        (
+            probes.SeenGoWhereTold(),
+            {"batch_size": 32, "encoder_filters": (8, 8), "normalizer_floor": 1.0, "encoders": "shared"},
+        ),
     ],
     ids=["states, two seeds", "images, one encoder"],
 )

@@ -151,9 +151,24 @@ def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: 
 
 
 @functools.cache
-def by_matrices(name: str, count: int):
+def steps_by_matrices(name: str):
+    """Function of a batch and a number of steps; the number is an argument, so that one program takes any."""
     env = environments.make(name)
-    return env, jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model._take_mjx_steps(env._model, data, count, True)))
+
+    def one_step(_: Any, data: mjx.Data) -> mjx.Data:
+        return mjx_model._take_mjx_steps(env._model, data, 1, True)
+
+    return jaxrl_vis_envs.jit(jax.vmap(lambda data, count: jax.lax.fori_loop(0, count, one_step, data), (0, None)))
+
+
+def by_matrices(name: str, count: int):
+    # From the host: a batch that a program returned is committed to its device, which would compile another one.
+    return environments.make(name), lambda data: steps_by_matrices(name)(jax.device_get(data), count)
+
+
+def repeated(data: mjx.Data, count: int) -> mjx.Data:
+    """So many copies, made on the host: on a device each size of leaf would be a program to compile."""
+    return jax.tree.map(lambda leaf: np.tile(leaf, (count,) + (1,) * leaf.ndim), jax.device_get(data))
 
 
 @functools.cache
@@ -163,7 +178,7 @@ def states(name: str) -> mjx.Data:
     rng = np.random.default_rng(0)
     actions = jnp.asarray(rng.uniform(-1, 1, (4, 48, env.action_size)), jnp.float32)
     if name == "HandReach":
-        data = jax.tree.map(lambda leaf: jnp.tile(leaf, (48,) + (1,) * leaf.ndim), env._start)
+        data = repeated(env._start, 48)
         actions = jax.vmap(jax.vmap(env._targets))(actions)
     else:
         data = jax.jit(jax.vmap(env.sample_start))(jax.random.split(jax.random.key(3), 48))
@@ -210,26 +225,27 @@ def test_on_a_cpu_the_finger_has_the_scalar_engine():
     env, _ = by_matrices("FingerTurn", 1)
     _, control_step = by_matrices("FingerTurn", env.config.substeps)
     after = control_step(data)
-    found = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, env.config.substeps, True)))(data)
+    take = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, env.config.substeps, True)))
+    found = take(data)
     assert not np.array_equal(found.qpos, after.qpos)  # or they would be matrices, too
     for name in ("qpos", "time"):
         np.testing.assert_allclose(getattr(found, name), getattr(after, name), atol=1e-3)
     assert np.median(np.abs(found.qpos - after.qpos).max(axis=1)) < 2e-6
     np.testing.assert_allclose(found.qacc_warmstart, found.qacc)
-    pushed = data.replace(xfrc_applied=data.xfrc_applied.at[0, 1, 0].set(1.0))
-    found = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, 1, True)))(pushed)
+    pushed = data.replace(xfrc_applied=jnp.asarray(data.xfrc_applied).at[0, 1, 0].set(1.0))
+    found = take(pushed)
     assert np.isnan(found.qpos[0]).all() and np.isfinite(found.qpos[1:]).all()
     # Whoever says that bodies are pushed gets what MJX does.
+    single = jax.tree.map(lambda leaf: leaf[0], jax.device_get(pushed))
     disturbed = functools.partial(mjx_model.take_steps, env._model, count=1, exact=True, disturbed=True)
-    found = jaxrl_vis_envs.jit(jax.vmap(disturbed))(pushed)
-    _, one_step = by_matrices("FingerTurn", 1)
-    np.testing.assert_array_equal(found.qpos, one_step(pushed).qpos)
-    assert not np.array_equal(found.qvel[0], one_step(data).qvel[0])
+    matrices = functools.partial(mjx_model._take_mjx_steps, env._model, count=1, exact=True)
+    assert str(jax.make_jaxpr(disturbed)(single)) == str(jax.make_jaxpr(matrices)(single))
+    assert not np.array_equal(control_step(pushed).qvel[0], after.qvel[0])
 
 
 def odd_states(mj_model: mujoco.MjModel, count: int) -> mjx.Data:
     rng = np.random.default_rng(4)
-    data = jax.tree.map(lambda leaf: jnp.tile(leaf, (count,) + (1,) * leaf.ndim), mjx_model.rest_data(mj_model))
+    data = repeated(mjx_model.rest_data(mj_model), count)
     draw = {"qpos": 0.5, "qvel": 2.0, "qacc_warmstart": 10.0, "qfrc_applied": 1.0, "ctrl": 1.5}
     sizes = {name: getattr(data, name).shape for name in draw}
     return data.replace(**{name: jnp.asarray(rng.normal(0, draw[name], sizes[name]), jnp.float32) for name in draw})
@@ -406,8 +422,8 @@ def test_sine_and_cosine():
 def test_the_kernel_takes_the_same_steps():
     """Two axes of episodes, as in training: seeds and environments."""
     env, many_steps = by_matrices("FingerTurn", 3)
-    data = jax.tree.map(lambda leaf: leaf[:6], states("FingerTurn"))
-    after = many_steps(data)
+    start, end = states("FingerTurn"), many_steps(states("FingerTurn"))
+    data, after = (jax.tree.map(lambda leaf: leaf[:6], jax.device_get(each)) for each in (start, end))
     in_two_axes = jax.tree.map(lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), data)
     take = functools.partial(steps_kernel.simulate, interpret=True)
     kernel = functools.partial(scalar._simulate_with, take, env._model, count=3, exact=True)
@@ -416,9 +432,9 @@ def test_the_kernel_takes_the_same_steps():
     for name in ("qpos", "qvel", "qacc", "qacc_warmstart", "qfrc_constraint", "time"):
         mine, theirs = np.asarray(getattr(ours, name)), np.asarray(getattr(after, name))
         np.testing.assert_allclose(mine.reshape(theirs.shape), theirs, rtol=1e-3, atol=1e-3 if "acc" in name else 1e-4)
-        assert mine.dtype == theirs.dtype and getattr(ours, name).weak_type == getattr(after, name).weak_type
+        assert mine.dtype == theirs.dtype and getattr(ours, name).weak_type == getattr(end, name).weak_type
 
-    pushed = in_two_axes.replace(xfrc_applied=in_two_axes.xfrc_applied.at[1, 2, 1, 0].set(1.0))
+    pushed = in_two_axes.replace(xfrc_applied=jnp.asarray(in_two_axes.xfrc_applied).at[1, 2, 1, 0].set(1.0))
     is_number = np.isfinite(run(pushed).qpos).all(axis=-1)
     np.testing.assert_array_equal(is_number, [[True, True, True], [True, True, False]])
 

@@ -49,6 +49,16 @@ def test_outputs_are_stripped(path: Path, nbformat: Any) -> None:
             assert cell.execution_count is None
 
 
+# Runs of equal configurations, of any of the notebooks, share what is traced and compiled.
+_ALIKE = f"""
+import sys
+sys.path.append({str(Path(__file__).resolve().parents[1])!r})
+import small_program
+from jaxrl_vis.run import trainer
+trainer.make_train_step = small_program.make_train_step
+"""
+
+
 @pytest.fixture(scope="module")
 def kernel(tmp_path_factory: pytest.TempPathFactory, nbclient: Any) -> Iterator[Any]:
     """Kernel shared by all notebooks, so that modules are imported once; each begins without the names of earlier ones."""
@@ -57,6 +67,7 @@ def kernel(tmp_path_factory: pytest.TempPathFactory, nbclient: Any) -> Iterator[
     startup = ipython / "profile_default/startup"
     startup.mkdir(parents=True)
     (startup / "garbage.py").write_text("import gc\ngc.set_threshold(100_000, 20, 20)\n")  # as in conftest.py
+    (startup / "programs.py").write_text(_ALIKE)
     changes = {
         "PYTHONPATH": os.pathsep.join((str(checkout), str(checkout / "envs"))),
         "JAXRL_VIS_NOTEBOOK_FAST": "1",

@@ -372,13 +372,18 @@ def test_both_ways_find_the_explicit_gramian() -> None:
     params, batch = problem(0)
     expected = explicit_gramian(params, batch)
     for mode in ("per_loss", "latents"):
-        seen: list[Any] = []
-        with spying(seen) as weighting:
-            gradient = jw.weighted_grad(losses_of_latents, weighting, encoder_of, mode, encode=encode)
-            result = gradient(params, weighting.init(tuple(params["heads"])), batch)
-        assert seen[0].dtype == jnp.float64
-        np.testing.assert_allclose(seen[0], expected, rtol=1e-10)
-        np.testing.assert_allclose(seen[0], np.asarray(seen[0]).T)
+
+        @jax.jit
+        def find(params: Any, batch: Any, mode: Any = mode) -> Any:
+            seen: list[Any] = []
+            with spying(seen) as weighting:
+                gradient = jw.weighted_grad(losses_of_latents, weighting, encoder_of, mode, encode=encode)
+                return gradient(params, weighting.init(tuple(params["heads"])), batch), seen[0]
+
+        result, gramian = find(params, batch)
+        assert gramian.dtype == jnp.float64
+        np.testing.assert_allclose(gramian, expected, rtol=1e-10)
+        np.testing.assert_allclose(gramian, np.asarray(gramian).T)
     assert result.gradient["encoder"]["kernel"].shape == (5, 4)
 
 
@@ -405,7 +410,7 @@ def test_gramians_through_groups_of_latents_and_of_parts_of_a_batch() -> None:
             gradient(params, weighting.init(tuple(params["heads"])), part)
         return seen[-1]
 
-    found = jax.vmap(on_parts, axis_name="devices")(parts)
+    found = jax.jit(jax.vmap(on_parts, axis_name="devices"))(parts)
     for each in found:
         np.testing.assert_allclose(each, explicit_gramian(params, batch), rtol=1e-10)
 
