@@ -17,7 +17,9 @@ _HORIZON = SHAPE[0] // 2
 _PHOTOGRAPHS = (("skimage", "data"), ("sklearn", "datasets/images"))
 
 
-def sample_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky: float) -> np.ndarray:
+def sample_backdrop(
+    rng: np.random.Generator, indoors: bool, photograph: bool, sky: float, glare: float = 1.0
+) -> np.ndarray:
     """Sample a backdrop.
 
     Args:
@@ -25,6 +27,7 @@ def sample_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, s
         indoors: Sample a wall and a ceiling instead of the sky and a skyline.
         photograph: Use a photograph shipped with an installed package instead; takes precedence over ``indoors``.
         sky: Light of the sky on a white surface, which scales the radiance.
+        glare: Factor of the radiance of the sky outdoors alone: large for a white sky, small for a dark one.
 
     Returns:
         [*SHAPE, 3] float32 radiance.
@@ -34,7 +37,7 @@ def sample_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, s
     """
     if photograph:
         return (_photograph(rng) * sky * rng.uniform(0.6, 1.6)).astype(np.float32)
-    picture = _room(rng) if indoors else _outdoors(rng)
+    picture = _room(rng) if indoors else _outdoors(rng, glare)
     return (picture * sky).astype(np.float32)
 
 
@@ -54,7 +57,7 @@ def smooth_noise(rng: np.random.Generator, size: tuple[float, float], shape: tup
     return ranks.reshape(shape)
 
 
-def _outdoors(rng: np.random.Generator) -> np.ndarray:
+def _outdoors(rng: np.random.Generator, glare: float) -> np.ndarray:
     """Sample a sky with clouds, a ground, and one to three of: trees, a building, a crop's canopy, trunks."""
     elevation = ((_HORIZON - np.arange(SHAPE[0])) / _HORIZON * REACH[0])[:, None, None]
     zenith = np.array([0.25, 0.45, 0.95]) * rng.uniform(0.5, 1.3)
@@ -65,6 +68,7 @@ def _outdoors(rng: np.random.Generator) -> np.ndarray:
     clouds = 0.6 * smooth_noise(rng, (30, 90)) + 0.4 * smooth_noise(rng, (10, 25))
     thick = np.clip((clouds - (1.0 - cover)) / 0.25, 0.0, 1.0)[..., None]
     picture = picture + (np.array([1.0, 1.0, 1.02]) * rng.uniform(0.7, 1.8) - picture) * thick
+    picture = picture * glare
     below = np.where(rng.random() < 0.5, [0.05, 0.08, 0.03], [0.14, 0.11, 0.08]) * rng.uniform(0.5, 1.5)
     picture = np.where(elevation < 0, below * (0.6 + 0.8 * smooth_noise(rng, (4, 10))[..., None]), picture)
     for layer in rng.permutation(["trees", "building", "canopy", "trunks"])[: rng.integers(1, 4)]:

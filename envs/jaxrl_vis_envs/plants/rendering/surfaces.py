@@ -8,13 +8,14 @@ import numpy as np
 from jaxrl_vis_envs.plants.clutter import objects
 from jaxrl_vis_envs.plants.family import Range, Textures
 from jaxrl_vis_envs.plants.field import Leaf, Plot, Stalk, generator
+from jaxrl_vis_envs.plants.organs import sample_organs
 
 GROUND = -2
 """Label of the ground in an instance image, in which 0, 1, ... are the stalks of a plot."""
 NOTHING = -1
 """Label where nothing is within the rendered depth."""
 OBJECT = -(1 << 20)
-"""Label of round objects other than plants, such as poles."""
+"""Label of round objects that are no stalks, such as poles and ears."""
 LITTER = -3
 """Label of litter and flat objects; that of the leaves of stalk n is `LITTER` - 1 - n."""
 
@@ -77,15 +78,16 @@ def build_surfaces(plot: Plot) -> Surfaces:
     for index, stalk in enumerate(plot.stalks):
         cones.append(_cones(index, stalk, len(materials)))
         materials.append(_material(rng, textures, textures.stalk_hue, textures.dry_hue, (0.35, 0.7), (0.30, 0.5)))
+    organs, clasping = sample_organs(plot) if by_day else ([], [])
     strips = []
-    for leaf in plot.leaves:
+    for leaf in (*plot.leaves, *clasping):
         strips.append(_triangles(leaf, len(materials)))
         hue = textures.dry_hue if leaf.dry else textures.leaf_hue
         saturation, value = ((0.35, 0.6), (0.14, 0.34)) if leaf.dry else ((0.5, 0.75), (0.09, 0.19))
         materials.append(_material(rng, textures, hue, textures.dry_hue, saturation, value))
     if by_day:
         round_things, flat_things = objects(plot)
-        for tube, paint in round_things:
+        for tube, paint in [*round_things, *organs]:
             cones.append(_cones(OBJECT, tube, len(materials)))
             materials.append(paint)
         for ribbon, paint in flat_things:
