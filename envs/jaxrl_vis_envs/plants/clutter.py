@@ -48,7 +48,7 @@ def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Lea
             round_things.append((tube([start, start + across], radius), paint))
     round_things += sample_structures(rng, scene.structures[0], family.layout.plot_length, family.rig.distance)
     if scene.potted:
-        round_things += _pots(rng, plot)
+        round_things += _pots(generator(family, plot.seed, "pots"), plot)
     if scene.robot:
         round_things += _robot(rng, family)
     return round_things, flat_things
@@ -82,7 +82,7 @@ def _pots(rng: np.random.Generator, plot: Plot) -> list[tuple[Stalk, list[float]
     dark = [0.03, 0.03, 0.035] if rng.random() < 0.6 else list(colorsys.hsv_to_rgb(0.05, 0.6, 0.35))
     pots = []
     for stalk in plot.measured:
-        foot, tall, wide = stalk.points[0] * [1.0, 1.0, 0.0], rng.uniform(0.08, 0.19), rng.uniform(0.06, 0.14)
+        foot, tall, wide = stalk.points[0] * [1.0, 1.0, 0.0], rng.uniform(0.08, 0.3), rng.uniform(0.06, 0.18)
         pots.append((tube([foot, foot + tall * _UP], 0.8 * wide, wide), plain_material(rng, dark)))
         earth = tube([foot + 0.7 * tall * _UP, foot + 1.1 * tall * _UP], 0.8 * wide, 0.01)
         pots.append((earth, plain_material(rng, [0.06, 0.04, 0.03])))

@@ -17,15 +17,15 @@ def sample_organs(plot: Plot) -> tuple[list[Tube], list[Leaf]]:
     """Sample the organs of the plants of a plot by day.
 
     Returns:
-        Round organs: ears and tassels of maize, panicles of sorghum; and leaves: the bases of leaves that clasp a stalk and
-        hide it at its nodes, and long dry leaves that hang along it.
+        Round organs: ears and tassels of maize, panicles of sorghum; and leaves of the near row: bases of leaves that clasp a
+        stalk and hide it at its nodes, and long dry leaves that hang along it.
     """
     rng = generator(plot.family, plot.seed, "organs")
     scene, ripe = plot.family.scene, plot.family.leaves.dry
     organs: list[Tube] = []
     leaves: list[Leaf] = []
     for index, stalk in enumerate(plot.stalks):
-        for node in stalk.nodes:
+        for node in stalk.nodes if stalk.row == 0 else ():
             clasping, hanging = rng.random(2) < (scene.organs[0], scene.hanging[0])
             if clasping:
                 leaves.append(_clasp(rng, index, stalk, node, dry=bool(rng.random() < ripe)))

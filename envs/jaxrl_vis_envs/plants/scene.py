@@ -69,7 +69,7 @@ class Scene:
     lone: float = 0.3
     """Fraction of plots by day without rows behind the near one."""
     walls: Range = (0.0, 1.6)
-    """Mean number of walls and fences behind the row, at times in front of it: sheets, planks, pickets, wire, windows, tiles."""
+    """Mean number of walls and fences behind the row or, at times, in front of it: sheets, planks, pickets, wire, windows."""
     structures: Range = (0.0, 2.5)
     """Mean number of tripods, scaffolds, hoses, bare trees and rows of trunks."""
     organs: Range = (0.0, 1.0)

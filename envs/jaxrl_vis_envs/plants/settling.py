@@ -53,7 +53,8 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
         scene = dataclasses.replace(scene, grass=0.0)
     if scene.lone:
         layout = dataclasses.replace(layout, rows_behind=0)
-    width, height, focal = family.rig.width, family.rig.height, 0.5 * family.rig.width / math.tan(math.radians(scene.lens[0]) / 2)
+    width, height = family.rig.width, family.rig.height
+    focal = 0.5 * width / math.tan(math.radians(scene.lens[0]) / 2)
     if scene.portrait:
         width, height = height, width
     if scene.single:
@@ -84,11 +85,13 @@ def _single(
     """Sample a single plant and the distance (m) at which an image with half a view of tangent ``slope`` shows most of it."""
     tall = rng.uniform(0.9, 2.3)
     # From a part of the plant to a plant that is small in its image.
-    distance = float(np.clip(0.5 * tall / slope * rng.uniform(0.5, 1.6), 0.4, 4.0))
+    distance = float(np.clip(0.5 * tall / slope * rng.uniform(0.6, 1.9), 0.4, 4.0))
     camera_height = float(np.clip(tall * rng.uniform(0.3, 0.8), 0.1, 2.0))
-    scene = dataclasses.replace(scene, camera_height=(camera_height, camera_height), pitch=(rng.uniform(-8.0, 12.0),) * 2)
+    pitch = rng.uniform(-8.0, 12.0)
+    scene = dataclasses.replace(scene, camera_height=(camera_height, camera_height), pitch=(pitch, pitch))
     layout = dataclasses.replace(layout, plot_length=0.3, stalks_mean=1, stalks_sd=0.0, tillers=0.0, rows_behind=0)
-    stalks = dataclasses.replace(stalks, height=(tall, tall))
+    spacing = rng.uniform(0.06, 0.1) * tall
+    stalks = dataclasses.replace(stalks, height=(tall, tall), node_spacing=(0.7 * spacing, 1.3 * spacing))
     # Seen on its own, a plant keeps the leaves that machines strip from the lower part of a row.
     every = {"lower": rng.uniform(0.2, 1.0), "middle": rng.uniform(0.6, 1.0), "upper": 1.0}
     leaves = dataclasses.replace(leaves, **every, density=1.0, litter=leaves.litter * rng.uniform(0.0, 0.3))

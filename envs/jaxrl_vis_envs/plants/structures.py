@@ -31,7 +31,9 @@ def tube(corners: list[np.ndarray], radius: float | np.ndarray, end: float | Non
             radii.append(at_corners[number] + (at_corners[number + 1] - at_corners[number]) * fraction)
     line, wide = np.array(points, float), np.array(radii, float)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    return Stalk(-1, line, wide, wide, arc, np.zeros(len(line)), np.zeros(0), 1.0, 0.0)
+    # The direction of the maximum diameter, without effect on a round tube, must not be that of its axis.
+    sideways = math.atan2(line[-1, 1] - line[0, 1], line[-1, 0] - line[0, 0]) + math.pi / 2
+    return Stalk(-1, line, wide, wide, arc, np.zeros(len(line)), np.zeros(0), 1.0, sideways)
 
 
 def plain_material(rng: np.random.Generator, colour: list[float], grain: float = 0.05) -> list[float]:

@@ -1,4 +1,4 @@
-"""What lenses, software and people add to an image: flare, repeated borders, lines, rectangles and text. NumPy and Pillow only."""
+"""Lens flare, repeated borders, and lines, rectangles and text drawn over an image. NumPy and Pillow only."""
 
 import colorsys
 

@@ -38,7 +38,8 @@ def sample_panels(rng: np.random.Generator, family: Family) -> list[Panel]:
     detail = family.rig.focal / distance  # pixels per m at the row
     panels = []
     if scene.indoors:
-        panels += _room(rng, middle, distance, detail)
+        aside = distance * math.sin(math.radians(scene.yaw[0]))  # the cameras' way to the side of the plot's middle
+        panels += _room(rng, middle, distance, detail, 2.0 * aside)
     # The usual kinds are as frequent as they are likely to be mistaken for stalks.
     for _ in range(rng.poisson(scene.walls[0])):
         kind = str(rng.choice(list(walls.KINDS), p=walls.SHARES))
@@ -87,9 +88,9 @@ def _box(rng: np.random.Generator, foot: np.ndarray, size: np.ndarray, colour: n
     return faces
 
 
-def _room(rng: np.random.Generator, middle: float, distance: float, detail: float) -> list[Panel]:
+def _room(rng: np.random.Generator, middle: float, distance: float, detail: float, wider: float) -> list[Panel]:
     """Sample a room: back and side walls, a ceiling with lamps, a floor, tables, chairs, boxes and boards."""
-    back, tall, wide = rng.uniform(0.6, 4.5), rng.uniform(2.3, 3.6), rng.uniform(6.0, 12.0)
+    back, tall, wide = rng.uniform(0.6, 4.5), rng.uniform(2.3, 3.6), rng.uniform(6.0, 12.0) + wider
     wall_detail = detail * distance / (distance + back)
     at = np.array([middle + rng.uniform(-1.5, 1.5), back, 0.0])
     kind = str(rng.choice(["plaster", "bricks", "sheet", "windows", "planks", "shelves"], p=[0.4, 0.2, 0.1, 0.15, 0.05, 0.1]))
@@ -99,10 +100,12 @@ def _room(rng: np.random.Generator, middle: float, distance: float, detail: floa
     across, along = np.array([wide, 0.0, 0.0]), np.array([0.0, deep, 0.0])
     ceiling, floor = (walls.paint_wall(rng, kind, (wide, deep), _texels((wide, deep), detail)) for kind in ("ceiling", "tiles"))
     panels.append(Panel(near + tall * _UP, across, along, ceiling))
-    if rng.random() < 0.5:
+    if rng.random() < 0.6:
         panels.append(Panel(near + 0.002 * _UP, across, along, floor))
     side = rng.choice([0.0, 1.0])
-    aside = walls.paint_wall(rng, str(rng.choice(["plaster", "windows", "bricks"])), (deep, tall), _texels((deep, tall), detail))
+    aside = walls.paint_wall(
+        rng, str(rng.choice(["plaster", "windows", "bricks"])), (deep, tall), _texels((deep, tall), detail)
+    )
     panels.append(Panel(near + side * across, along, tall * _UP, aside))
     for _ in range(rng.integers(0, 3)):
         size = (rng.uniform(0.5, 2.5), rng.uniform(0.4, 1.2))
@@ -149,14 +152,14 @@ def render_panels(
         if window is None:
             continue
         rows, columns = window
-        line, column = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None], np.arange(
-            columns.start, columns.stop, dtype=np.float32
-        )
+        line = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None]
+        column = np.arange(columns.start, columns.stop, dtype=np.float32)[None, :]
         # A pixel p at planar depth z is at (a, b) of the panel, where (a, b, 1) = z G p with the inverse G of the homography.
         first, second, third = (
             (line * np.float32(g[1]) + np.float32(g[2])) + column * np.float32(g[0]) for g in np.linalg.inv(homography)
         )
-        inside = (third * depth[rows, columns] > 1.0) & (third < 1.0 / NEAR)
+        with np.errstate(invalid="ignore"):  # nothing is infinitely far, and 0 times infinity
+            inside = (third * depth[rows, columns] > 1.0) & (third < 1.0 / NEAR)
         inside &= (first >= 0) & (first < third) & (second >= 0) & (second < third)
         there = np.nonzero(inside)
         if not len(there[0]):

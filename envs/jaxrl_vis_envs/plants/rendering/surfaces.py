@@ -9,6 +9,7 @@ from jaxrl_vis_envs.plants.clutter import objects
 from jaxrl_vis_envs.plants.family import Range, Textures
 from jaxrl_vis_envs.plants.field import Leaf, Plot, Stalk, generator
 from jaxrl_vis_envs.plants.organs import sample_organs
+from jaxrl_vis_envs.plants.scene import Scene
 
 GROUND = -2
 """Label of the ground in an instance image, in which 0, 1, ... are the stalks of a plot."""
@@ -73,7 +74,7 @@ def build_surfaces(plot: Plot) -> Surfaces:
     materials = [_ground(rng, textures)]
     by_day = plot.family.scene.share > 0
     if by_day:
-        materials = [_ground_by_day(rng, plot.family.scene.grass > 0, materials[0])]
+        materials = [_ground_by_day(rng, plot.family.scene, materials[0])]
     cones = []
     for index, stalk in enumerate(plot.stalks):
         cones.append(_cones(index, stalk, len(materials)))
@@ -188,33 +189,17 @@ def _material(
     ]
 
 
-def _ground_by_day(rng: np.random.Generator, grass: bool, soil: list[float]) -> list[float]:
-    """Sample the material of a ground by day: grass, or soil or concrete of any brightness."""
+def _ground_by_day(rng: np.random.Generator, scene: Scene, soil: list[float]) -> list[float]:
+    """Sample the material of a ground by day: grass, or soil or concrete of any brightness; indoors, a smooth floor."""
     place = soil[-2]
-    if grass:
+    if scene.grass:
         colour = colorsys.hsv_to_rgb(rng.uniform(0.18, 0.3), rng.uniform(0.4, 0.8), rng.uniform(0.08, 0.3))
         over = colorsys.hsv_to_rgb(rng.uniform(0.1, 0.25), rng.uniform(0.3, 0.7), rng.uniform(0.1, 0.4))
         return [*colour, *over, 1 / 0.008, 0.6, 1 / 0.15, 0.4, 0.3, 1 / 0.02, 0.0, 10.0, 0.0, 0.0, place, 0.5]
-    if rng.random() < 0.3:
+    if scene.indoors or rng.random() < 0.3:
         grey = rng.uniform(0.15, 0.6)
-        return [
-            grey,
-            grey,
-            grey,
-            *([0.9 * grey] * 3),
-            1 / 0.003,
-            0.1,
-            1 / 0.3,
-            0.15,
-            0.0,
-            1 / 0.01,
-            0.0,
-            10.0,
-            0.0,
-            0.05,
-            place,
-            0.5,
-        ]
+        over = [0.9 * grey] * 3
+        return [grey, grey, grey, *over, 1 / 0.003, 0.1, 1 / 0.3, 0.15, 0.0, 1 / 0.01, 0.0, 10.0, 0.0, 0.05, place, 0.5]
     brightness = rng.uniform(0.6, 2.0)
     return [brightness * channel for channel in soil[:6]] + soil[6:]
 
