@@ -34,10 +34,11 @@ def daylight(family: Family, seed: int) -> shading.Day | None:
     rng = generator(family, seed, "daylight")
     height, azimuth = np.radians(scene.elevation[0]), rng.uniform(-np.pi, np.pi)
     sun = np.array([np.cos(height) * np.sin(azimuth), np.cos(height) * np.cos(azimuth), np.sin(height)])
-    strength = 0.0 if scene.indoors else scene.sun[0]
+    # Indoors, lamps and windows light one side, without shadows of a canopy.
+    strength, depth = (0.6 * scene.sky[0], 0.0) if scene.indoors else (scene.sun[0], scene.shadow[0])
     warm = np.array([1.0, rng.uniform(0.85, 1.0), rng.uniform(0.65, 0.95)])
     blue = np.array([rng.uniform(0.75, 1.0), rng.uniform(0.85, 1.0), 1.0])
-    shadow = (scene.shadow[0], rng.uniform(0.2, 0.7), rng.uniform(0.05, 0.4), rng.uniform(0.02, 0.1))
+    shadow = (depth, rng.uniform(0.2, 0.7), rng.uniform(0.05, 0.4), rng.uniform(0.02, 0.1))
     brightness = scene.sky[0] + 0.3 * strength
     backdrop = sample_backdrop(rng, scene.indoors > 0, scene.photographs > 0, brightness, 2.0 ** scene.glare[0])
     values = (sun, strength * warm, scene.sky[0] * blue, np.array(shadow), backdrop)

@@ -63,6 +63,8 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
         layout = dataclasses.replace(layout, plot_length=0.3, stalks_mean=rng.integers(1, 3), stalks_sd=0.0, rows_behind=0)
         leaves = dataclasses.replace(leaves, litter=0.0)
         distance *= rng.uniform(1.0, 2.0)
+    # Few plants are seen from half a view's way to the side, so that the images of a plot differ.
+    stretch = 0.5 * width / focal * distance if scene.single or scene.potted else family.rig.stretch
     leaves = dataclasses.replace(leaves, litter=leaves.litter * scene.straw[0])
     rig = dataclasses.replace(
         family.rig,
@@ -74,6 +76,7 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
         camera_height_sd=0.0,
         distance_sd=0.0,
         pitch=scene.pitch[0],
+        stretch=stretch,
     )
     imaging = dataclasses.replace(family.imaging, flash=(0.01, 0.01))
     return _family(family, scene, layout, stalks, leaves, textures, rig, imaging)
@@ -85,7 +88,7 @@ def _single(
     """Sample a single plant and the distance (m) at which an image with half a view of tangent ``slope`` shows most of it."""
     tall = rng.uniform(0.9, 2.3)
     # From a part of the plant to a plant that is small in its image.
-    distance = float(np.clip(0.5 * tall / slope * rng.uniform(0.6, 1.9), 0.4, 4.0))
+    distance = float(np.clip(0.5 * tall / slope * rng.uniform(0.5, 1.6), 0.4, 4.0))
     camera_height = float(np.clip(tall * rng.uniform(0.3, 0.8), 0.1, 2.0))
     pitch = rng.uniform(-8.0, 12.0)
     scene = dataclasses.replace(scene, camera_height=(camera_height, camera_height), pitch=(pitch, pitch))

@@ -76,7 +76,10 @@ def _outdoors(rng: np.random.Generator, glare: float) -> np.ndarray:
     picture = picture * glare
     below = np.where(rng.random() < 0.5, [0.05, 0.08, 0.03], [0.14, 0.11, 0.08]) * rng.uniform(0.5, 1.5)
     picture = np.where(elevation < 0, below * (0.6 + 0.8 * smooth_noise(rng, (4, 10))[..., None]), picture)
-    for layer in rng.permutation(["trees", "building", "canopy", "trunks"])[: rng.integers(1, 4)]:
+    layers = rng.choice(
+        ["trees", "building", "canopy", "trunks"], rng.integers(1, 4), replace=False, p=[0.35, 0.35, 0.12, 0.18]
+    )
+    for layer in layers:
         picture = {"trees": _trees, "building": _building, "canopy": _canopy, "trunks": _trunks}[layer](rng, picture)
     return picture
 
@@ -117,10 +120,10 @@ def _canopy(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
     green = np.array([0.10, 0.16, 0.04]) * rng.uniform(0.5, 1.8) * rng.uniform(0.8, 1.2, 3)
     dry = np.array([0.30, 0.24, 0.14]) * rng.uniform(0.5, 1.5)
     ripe = np.clip(smooth_noise(rng, (20, 5)) + rng.uniform(-0.7, 0.7), 0.0, 1.0)[..., None]
-    streaks = 0.25 + 1.5 * smooth_noise(rng, (rng.uniform(20, 80), rng.uniform(2, 5)))
-    leaves = 0.4 + 1.2 * smooth_noise(rng, (5, 9))
+    streaks = 0.25 + 1.5 * smooth_noise(rng, (rng.uniform(15, 80), rng.uniform(3, 9)))
+    leaves = 0.4 + 0.8 * smooth_noise(rng, (8, 14)) + 0.4 * smooth_noise(rng, (3, 5))
     texture = (streaks * leaves)[..., None]
-    gaps = (smooth_noise(rng, (12, 5)) < rng.uniform(0.0, 0.35)) & mask
+    gaps = (smooth_noise(rng, (rng.uniform(12, 40), rng.uniform(6, 16))) < rng.uniform(0.0, 0.3)) & mask
     colours = (green + (dry - green) * ripe) * texture
     return np.where((mask & ~gaps)[..., None], colours, picture)
 

@@ -43,7 +43,7 @@ def sample_panels(rng: np.random.Generator, family: Family) -> list[Panel]:
     # The usual kinds are as frequent as they are likely to be mistaken for stalks.
     for _ in range(rng.poisson(scene.walls[0])):
         kind = str(rng.choice(list(walls.KINDS), p=walls.SHARES))
-        wide, tall = (12.0 * rng.uniform(0.1, 1.0) ** 1.5, rng.uniform(0.6, 4.0))
+        wide, tall = rng.uniform(1.0, 12.0), rng.uniform(0.6, 4.0)
         turn = rng.normal(0.0, 0.25)
         gap = rng.uniform(0.12, 4.0) + 0.5 * wide * abs(math.sin(turn))
         if kind in _THIN and rng.random() < 0.25:

@@ -193,15 +193,19 @@ def _ground_by_day(rng: np.random.Generator, scene: Scene, soil: list[float]) ->
     """Sample the material of a ground by day: grass, or soil or concrete of any brightness; indoors, a smooth floor."""
     place = soil[-2]
     if scene.grass:
-        colour = colorsys.hsv_to_rgb(rng.uniform(0.18, 0.3), rng.uniform(0.4, 0.8), rng.uniform(0.08, 0.3))
-        over = colorsys.hsv_to_rgb(rng.uniform(0.1, 0.25), rng.uniform(0.3, 0.7), rng.uniform(0.1, 0.4))
+        hue, saturation, value = rng.uniform(0.18, 0.3), rng.uniform(0.4, 0.8), rng.uniform(0.08, 0.3)
+        colour = colorsys.hsv_to_rgb(hue, saturation, value)
+        # Patches of a lawn are of a similar green, or dry.
+        dry = rng.uniform(0.0, 0.12) if rng.random() < 0.3 else rng.uniform(-0.02, 0.03)
+        over = colorsys.hsv_to_rgb(hue - dry, saturation * rng.uniform(0.7, 1.1), value * rng.uniform(0.75, 1.5))
         return [*colour, *over, 1 / 0.008, 0.6, 1 / 0.15, 0.4, 0.3, 1 / 0.02, 0.0, 10.0, 0.0, 0.0, place, 0.5]
     if scene.indoors or rng.random() < 0.3:
         grey = rng.uniform(0.15, 0.6)
         over = [0.9 * grey] * 3
         return [grey, grey, grey, *over, 1 / 0.003, 0.1, 1 / 0.3, 0.15, 0.0, 1 / 0.01, 0.0, 10.0, 0.0, 0.05, place, 0.5]
-    brightness = rng.uniform(0.6, 2.0)
-    return [brightness * channel for channel in soil[:6]] + soil[6:]
+    brightness, contrast = rng.uniform(0.6, 2.0), rng.uniform(0.1, 1.0)
+    over = [base + contrast * (other - base) for base, other in zip(soil[:3], soil[3:6])]
+    return [brightness * channel for channel in (*soil[:3], *over)] + soil[6:]
 
 
 def _ground(rng: np.random.Generator, textures: Textures) -> list[float]:

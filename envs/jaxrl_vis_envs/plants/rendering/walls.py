@@ -16,7 +16,7 @@ def sample_colour(rng: np.random.Generator) -> np.ndarray:
     value = 0.03 * (0.9 / 0.03) ** rng.random()
     hue, saturation = {
         "grey": (rng.random(), rng.uniform(0.0, 0.12)),
-        "paint": (rng.random(), rng.uniform(0.4, 0.9)),
+        "paint": (rng.random(), rng.uniform(0.15, 0.75)),
         "wood": (rng.uniform(0.05, 0.12), rng.uniform(0.2, 0.65)),
         "green": (rng.uniform(0.2, 0.4), rng.uniform(0.3, 0.8)),
     }[str(kind)]
