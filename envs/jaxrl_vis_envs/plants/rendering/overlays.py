@@ -42,8 +42,10 @@ def replicate_border(image: np.ndarray, rng: np.random.Generator) -> tuple[np.nd
         The image, and a mask [H, W] bool, False in the strip.
     """
     turns = int(rng.integers(4))
-    values, shown = (np.rot90(part, turns).copy() for part in (image, np.ones(image.shape[:2], bool)))
-    strip = max(round(rng.uniform(0.005, 0.06) * values.shape[1]), 1)
+    values = np.rot90(image, turns).copy()
+    width = image.shape[1 - turns % 2]
+    shown = np.ones(values.shape[:2], bool)
+    strip = max(round(rng.uniform(0.005, 0.06) * width), 1)
     beside = values[:, strip : 2 * strip][:, ::-1] if rng.random() < 0.5 else values[:, strip : strip + 1]
     values[:, :strip], shown[:, :strip] = beside, False
     return np.rot90(values, -turns), np.rot90(shown, -turns)

@@ -12,7 +12,7 @@ from jaxrl_vis_envs.plants.rendering.tables import NEAR
 
 _MAX_SIDE = 1024  # texels
 _UP = np.array([0.0, 0.0, 1.0])
-_THIN = ("pickets", "wire", "blinds")  # kinds that may stand before the row
+_THIN = ("pickets", "wire")  # kinds that may stand before the row, as one looks through them
 
 
 @dataclasses.dataclass(frozen=True)

@@ -159,7 +159,7 @@ def _plaster(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, texels: flo
     colour = sample_colour(rng) if rng.random() < 0.3 else rng.uniform(0.3, 0.85) * rng.uniform(0.92, 1.08, 3)
     picture = _solid(colour, shade)
     picture[(y < 0.1)[:, 0]] *= rng.uniform(0.3, 1.2)
-    _bars(rng, picture, x, y, texels, rng.integers(0, 4))
+    _bars(rng, picture, x, y, texels, int(rng.integers(0, 4)))
     return _opaque(picture)
 
 
@@ -190,7 +190,7 @@ def _windows(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, texels: flo
     glass = rng.uniform(0.02, 0.9) * np.array([0.9, 0.97, 1.05]) * _weather(rng, inside.shape, 0.3)[..., None]
     pane = np.where((inside & is_frame)[..., None], sample_colour(rng), glass)
     picture[..., :3] = np.where(inside[..., None], pane, picture[..., :3])
-    _bars(rng, picture, x, y, texels, rng.integers(0, 3))
+    _bars(rng, picture, x, y, texels, int(rng.integers(0, 3)))
     return _opaque(picture)
 
 
@@ -237,7 +237,7 @@ def _ceiling(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, texels: flo
     """Paint a ceiling: panels or beams, and lamps, which are brighter than white."""
     picture = _bricks(rng, x, y, texels, ratio=1.0) if rng.random() < 0.5 else _planks(rng, x, y, texels)
     picture[..., :3] = picture[..., :3] / max(float(picture[..., :3].mean()), 0.05) * rng.uniform(0.15, 0.7)
-    _bars(rng, picture, x, y, texels, rng.integers(0, 8))
+    _bars(rng, picture, x, y, texels, int(rng.integers(0, 8)))
     pitch, size = rng.uniform(1.2, 2.6, 2), (rng.uniform(0.3, 1.3), rng.uniform(0.12, 0.7))
     lamp = (np.mod(x, pitch[0]) < size[0]) & (np.mod(y, pitch[1]) < size[1])
     picture[lamp, :3] = rng.uniform(2.5, 7.0) * np.array([1.0, rng.uniform(0.9, 1.0), rng.uniform(0.75, 1.0)])
