@@ -25,9 +25,12 @@ def by_day(**scene) -> plants.Family:
     return dataclasses.replace(TRAINING, name="day", stream=9, scene=Scene(share=1.0, **scene)).at_width(211)
 
 
+# No surroundings and no effects on images.
+PLAIN = {"robot": 0, "objects": (0, 0), "borders": 0, "walls": (0, 0), "structures": (0, 0), "organs": (0, 0),
+         "hanging": (0, 0), "flare": 0, "overlay": 0, "replicated": 0, "single": 0, "portrait": 0, "glare": (0, 0)}  # fmt: skip
 # Nothing but stalks, from aside and rolled.
 BARE = dataclasses.replace(
-    by_day(maize=0, potted=0, indoors=0, robot=0, objects=(0, 0), borders=0, yaw=(30, 30), roll=(5, 5), lens=(76, 76),
+    by_day(**PLAIN, maize=0, potted=0, indoors=0, yaw=(30, 30), roll=(5, 5), lens=(76, 76),
            distance=(0.8, 0.8), camera_height=(0.42, 0.42), pitch=(0, 0), resolution=(1, 1), motion=(0, 0)),
     leaves=dataclasses.replace(TRAINING.leaves, density=0.0, litter=0.0),
     layout=dataclasses.replace(TRAINING.layout, rows_behind=0),
@@ -99,7 +102,7 @@ def test_things_that_are_no_stalk_are_never_counted():
 
 
 def test_factors_stay_in_their_ranges():
-    family = by_day()
+    family = by_day(single=0, portrait=0)
     drawn = [plants.draw(dataclasses.replace(family, leaves=BARE.leaves), seed).family for seed in range(30)]
     views = [np.degrees(2 * np.arctan(0.5 * each.rig.width / each.rig.focal)) for each in drawn]
     assert 50 <= min(views) < 65 and 95 < max(views) <= 110
@@ -110,7 +113,7 @@ def test_factors_stay_in_their_ranges():
 
 def test_plain_cameras(bare):
     _, (image, *_) = bare
-    clean = Scene(white_balance=0.0, jpeg=(100, 100), motion=(0, 0), resolution=(1, 1), borders=0)
+    clean = Scene(white_balance=0.0, jpeg=(100, 100), motion=(0, 0), resolution=(1, 1), borders=0, overlay=0, replicated=0)
 
     def taken(**changes):
         return degrade(image, dataclasses.replace(clean, **changes), np.random.default_rng(3))
@@ -174,7 +177,7 @@ def test_a_blade_is_hidden_by_what_is_nearer():
 
 
 def test_blades_grow_on_grass_by_day_only():
-    with_grass = [grass(plants.draw(by_day(grass=1.0, indoors=0), seed).family, seed) for seed in range(8)]
+    with_grass = [grass(plants.draw(by_day(grass=1.0, indoors=0, single=0), seed).family, seed) for seed in range(8)]
     grown = [blades for blades in with_grass if blades is not None]
     assert 3 <= len(grown) < 8 and all(len(blades.points) > 500 for blades in grown)
     assert all(np.ptp(blades.points[:, 0, 2]) == 0 < blades.points[:, 2, 2].min() for blades in grown)

@@ -7,8 +7,9 @@ import numpy as np
 
 from jaxrl_vis_envs.plants.family import Family
 from jaxrl_vis_envs.plants.field import Leaf, Plot, Stalk, generator
+from jaxrl_vis_envs.plants.structures import plain_material, sample_arm, sample_structures, tube
 
-_MAX_SEGMENT = 0.1  # m: maximum length of the pieces of long objects, so that pieces out of sight can be culled
+_MAX_SEGMENT = 0.1  # m: maximum length of the pieces of a ribbon, so that pieces out of sight can be culled
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -33,20 +34,21 @@ def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Lea
         paint = material(rng)
         if kind == "pole":
             top = foot + [*rng.normal(0.0, 0.04, 2), 0.0] + _UP * rng.uniform(0.3, 2.6)
-            round_things.append((_tube([foot, top], _sample_log_uniform(rng, 0.003, 0.05)), paint))
+            round_things.append((tube([foot, top], _sample_log_uniform(rng, 0.003, 0.05)), paint))
         elif kind == "legs":
             for side in (-0.09, 0.09):
                 start = foot + [side, rng.uniform(0.1, 0.8), 0.0]
-                round_things.append((_tube([start, start + 0.9 * _UP], rng.uniform(0.05, 0.08)), paint))
+                round_things.append((tube([start, start + 0.9 * _UP], rng.uniform(0.05, 0.08)), paint))
         else:
             high = rng.uniform(0.02, 1.6)
             across = rng.normal(0.0, 1.0 if kind == "tube" else 0.05, 3) + [1.0, 0.0, 0.0]
             across *= rng.uniform(0.5, 2.5) / np.linalg.norm(across)
             start = foot + high * _UP
             radius = _sample_log_uniform(rng, 0.005, 0.04) if kind == "tube" else rng.uniform(0.001, 0.005)
-            round_things.append((_tube([start, start + across], radius), paint))
+            round_things.append((tube([start, start + across], radius), paint))
+    round_things += sample_structures(rng, scene.structures[0], family.layout.plot_length, family.rig.distance)
     if scene.potted:
-        round_things += _pots(rng, plot)
+        round_things += _pots(generator(family, plot.seed, "pots"), plot)
     if scene.robot:
         round_things += _robot(rng, family)
     return round_things, flat_things
@@ -59,18 +61,6 @@ def _offset_from_row(rng: np.random.Generator, family: Family) -> float:
 
 def _sample_log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return low * (high / low) ** rng.random()
-
-
-def _tube(corners: list[np.ndarray], radius: float, end: float | None = None) -> Stalk:
-    """Return a tube through corners [3], m, whose radius goes from ``radius`` to ``end``, m; None for a constant radius."""
-    points = [corners[0]]
-    for one, other in zip(corners, corners[1:]):
-        pieces = max(math.ceil(float(np.linalg.norm(other - one)) / _MAX_SEGMENT), 1)
-        points += [one + (other - one) * (piece + 1) / pieces for piece in range(pieces)]
-    line = np.array(points, float)
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    radii = np.linspace(radius, radius if end is None else end, len(line))
-    return Stalk(-1, line, radii, radii, arc, np.zeros(len(line)), np.zeros(0), 1.0, 0.0)
 
 
 def _ribbon(rng: np.random.Generator, foot: np.ndarray, kind: str) -> Leaf:
@@ -92,27 +82,23 @@ def _pots(rng: np.random.Generator, plot: Plot) -> list[tuple[Stalk, list[float]
     dark = [0.03, 0.03, 0.035] if rng.random() < 0.6 else list(colorsys.hsv_to_rgb(0.05, 0.6, 0.35))
     pots = []
     for stalk in plot.measured:
-        foot, tall, wide = stalk.points[0] * [1.0, 1.0, 0.0], rng.uniform(0.08, 0.19), rng.uniform(0.06, 0.14)
-        pots.append((_tube([foot, foot + tall * _UP], 0.8 * wide, wide), plain_material(rng, dark)))
-        earth = _tube([foot + 0.7 * tall * _UP, foot + 1.1 * tall * _UP], 0.8 * wide, 0.01)
+        foot, tall, wide = stalk.points[0] * [1.0, 1.0, 0.0], rng.uniform(0.08, 0.3), rng.uniform(0.06, 0.18)
+        pots.append((tube([foot, foot + tall * _UP], 0.8 * wide, wide), plain_material(rng, dark)))
+        earth = tube([foot + 0.7 * tall * _UP, foot + 1.1 * tall * _UP], 0.8 * wide, 0.01)
         pots.append((earth, plain_material(rng, [0.06, 0.04, 0.03])))
     return pots
 
 
 def _robot(rng: np.random.Generator, family: Family) -> list[tuple[Stalk, list[float]]]:
-    """Sample an arm of two to four thick light or dark links that reaches into the image, between cameras and row."""
-    grey = rng.uniform(0.5, 0.8) if rng.random() < 0.7 else rng.uniform(0.03, 0.2)
+    """Sample an arm that reaches into the image, between the cameras and the row."""
     middle = 0.5 * family.layout.plot_length + rng.uniform(-0.5, 0.5)
     side = rng.choice([-1.0, 1.0])
     near = -rng.uniform(0.2, 0.6) * family.rig.distance
-    at = np.array([middle + side * rng.uniform(0.5, 0.9), near, family.rig.camera_height + rng.uniform(0.3, 0.9)])
-    links = []
-    for _ in range(rng.integers(2, 5)):
-        step = np.array([-side * rng.uniform(0.0, 0.35), rng.normal(0.0, 0.05), rng.normal(-0.15, 0.2)])
-        radius = rng.uniform(0.025, 0.065)
-        links.append((_tube([at, at + step], radius), plain_material(rng, [grey] * 3)))
-        at = at + step
-    return links
+    return sample_arm(
+        rng,
+        np.array([middle + side * rng.uniform(0.5, 0.9), near, family.rig.camera_height + rng.uniform(0.3, 0.9)]),
+        side,
+    )
 
 
 def material(rng: np.random.Generator, green: bool = False) -> list[float]:
@@ -131,12 +117,3 @@ def material(rng: np.random.Generator, green: bool = False) -> list[float]:
     }[kind]
     grain = 0.5 if kind == "wood" else 0.05
     return plain_material(rng, list(colorsys.hsv_to_rgb(hue, saturation, rng.uniform(0.1, 0.7))), grain)
-
-
-def plain_material(rng: np.random.Generator, colour: list[float], grain: float = 0.05) -> list[float]:
-    """Sample a material of one colour (RGB, 0 to 1), with fibres of contrast ``grain`` and, in one of ten cases, bands."""
-    bands = rng.uniform(0.2, 0.8) if rng.random() < 0.1 else 0.0
-    return [
-        *colour, *colour, 1.0 / rng.uniform(1e-3, 6e-3), grain, 1.0 / rng.uniform(0.02, 0.1), rng.uniform(0.0, 0.25),
-        0.0, 500.0, bands, 1.0 / rng.uniform(0.05, 0.3), 0.0, rng.uniform(0.0, 0.4), rng.uniform(0.0, 50.0), 0.0,
-    ]  # fmt: skip

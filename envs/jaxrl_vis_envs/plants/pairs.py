@@ -15,6 +15,8 @@ from jaxrl_vis_envs.plants.rendering import drawing, imaging, shading, tables
 from jaxrl_vis_envs.plants.rendering.backdrop import sample_backdrop
 from jaxrl_vis_envs.plants.rendering.blades import Blades, render_blades, sample_blades
 from jaxrl_vis_envs.plants.rendering.degrading import degrade
+from jaxrl_vis_envs.plants.rendering.overlays import add_flare
+from jaxrl_vis_envs.plants.rendering.panels import Panel, render_panels, sample_panels
 from jaxrl_vis_envs.plants.rendering.surfaces import NOTHING, Surfaces, build_surfaces
 
 _FLASH = np.array([0.05, -0.10, -0.02])
@@ -32,11 +34,13 @@ def daylight(family: Family, seed: int) -> shading.Day | None:
     rng = generator(family, seed, "daylight")
     height, azimuth = np.radians(scene.elevation[0]), rng.uniform(-np.pi, np.pi)
     sun = np.array([np.cos(height) * np.sin(azimuth), np.cos(height) * np.cos(azimuth), np.sin(height)])
-    strength = 0.0 if scene.indoors else scene.sun[0]
+    # Indoors, lamps and windows light one side, without shadows of a canopy.
+    strength, depth = (0.6 * scene.sky[0], 0.0) if scene.indoors else (scene.sun[0], scene.shadow[0])
     warm = np.array([1.0, rng.uniform(0.85, 1.0), rng.uniform(0.65, 0.95)])
     blue = np.array([rng.uniform(0.75, 1.0), rng.uniform(0.85, 1.0), 1.0])
-    shadow = (scene.shadow[0], rng.uniform(0.2, 0.7), rng.uniform(0.05, 0.4), rng.uniform(0.02, 0.1))
-    backdrop = sample_backdrop(rng, scene.indoors > 0, scene.photographs > 0, scene.sky[0] + 0.3 * strength)
+    shadow = (depth, rng.uniform(0.2, 0.7), rng.uniform(0.05, 0.4), rng.uniform(0.02, 0.1))
+    brightness = scene.sky[0] + 0.3 * strength
+    backdrop = sample_backdrop(rng, scene.indoors > 0, scene.photographs > 0, brightness, 2.0 ** scene.glare[0])
     values = (sun, strength * warm, scene.sky[0] * blue, np.array(shadow), backdrop)
     return shading.Day(*(jnp.asarray(value, jnp.float32) for value in values))
 
@@ -48,6 +52,12 @@ def grass(family: Family, seed: int) -> Blades | None:
     if family.scene.share <= 0 or family.scene.grass <= 0 or rng.random() < _MOWN:
         return None
     return sample_blades(rng, family.layout.plot_length, family.rig.distance)
+
+
+@functools.lru_cache(maxsize=2)
+def panels(family: Family, seed: int) -> list[Panel]:
+    """Sample the walls, fences and furniture of a plot from its settled family; none at night."""
+    return sample_panels(generator(family, seed, "panels"), family) if family.scene.share > 0 else []
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,11 +148,9 @@ class Sequence:
         )
         shot = shading.Shot(*(jnp.asarray(value, jnp.float32) for value in values), day=daylight(family, self.plot.seed))
         radiance, instance, depth = drawing.render_view(view, shot, true.width, true.height, settings.samples)
-        blades = grass(family, self.plot.seed)
-        if blades is not None:
+        if shot.day is not None:
             camera = (pose.position + offset @ pose.rotation, pose.rotation, true.focal, true.centre)
-            arrays = np.asarray(radiance), np.asarray(instance), np.asarray(depth)
-            radiance = jnp.asarray(render_blades(*arrays, blades, camera))
+            radiance, instance, depth = self._add_surroundings((radiance, instance, depth), camera, shot.day)
         gain = 2.0 * gains[frame, camera_index]
         if shot.day is not None:
             gain *= 0.5 * family.scene.brightness[0] / max(float(radiance.mean()), 1e-4)
@@ -160,3 +168,18 @@ class Sequence:
             return image, instance, depth
         values, shown = degrade(np.asarray(image), family.scene, generator(family, self.plot.seed, f"degrade {frame}"))
         return jnp.asarray(values), jnp.where(jnp.asarray(shown), instance, NOTHING), depth
+
+    def _add_surroundings(self, images: tuple[jax.Array, ...], camera: tuple, day: shading.Day) -> tuple[jax.Array, ...]:
+        """Add panels, blades of grass and lens flare to the radiance, instance and depth images of a camera by day."""
+        family, seed = self.plot.family, self.plot.seed
+        radiance, instance, depth = map(np.asarray, images)
+        walls = panels(family, seed)
+        if walls:
+            light = np.asarray(day.sun), np.asarray(day.sunlight), np.asarray(day.skylight)
+            radiance, instance, depth = render_panels((radiance, instance, depth), walls, camera, light)
+        blades = grass(family, seed)
+        if blades is not None:
+            radiance = render_blades(radiance, instance, depth, blades, camera)
+        if family.scene.flare:
+            radiance = add_flare(radiance, generator(family, seed, "flare"))
+        return jnp.asarray(radiance), jnp.asarray(instance), jnp.asarray(depth)

@@ -34,7 +34,7 @@ class Scene:
     """Fraction of plots by day whose ground is grass; the others have soil or concrete."""
     straw: Range = (0.0, 3.0)
     """Factor of the number of pieces of dry leaf on the ground."""
-    distance: Range = (0.5, 1.6)
+    distance: Range = (0.4, 1.6)
     """Distance from the cameras to the row, m."""
     camera_height: Range = (0.25, 1.3)
     """Height of the cameras, m."""
@@ -62,11 +62,34 @@ class Scene:
     """Resolution at which an image is compressed, before it is enlarged to its size, relative to that size."""
     borders: float = 0.2
     """Fraction of images with black bars or wedges at their sides."""
+    single: float = 0.25
+    """Fraction of plots by day with one whole plant, from the pot or the ground to its top, instead of rows."""
+    portrait: float = 0.35
+    """Fraction of plots by day whose images are upright; the longer side keeps the view of the lens."""
+    lone: float = 0.3
+    """Fraction of plots by day without rows behind the near one."""
+    walls: Range = (0.0, 1.6)
+    """Mean number of walls and fences behind the row or, at times, in front of it: sheets, planks, pickets, wire, windows."""
+    structures: Range = (0.0, 2.5)
+    """Mean number of tripods, scaffolds, hoses, bare trees and rows of trunks."""
+    organs: Range = (0.0, 1.0)
+    """Fraction of the plants with ears, tassels or panicles, and of their nodes with a leaf that clasps the stalk."""
+    hanging: Range = (0.0, 0.5)
+    """Fraction of the nodes with a long dry leaf that hangs along the stalk."""
+    glare: Range = (-1.5, 1.5)
+    """Exposure of the sky behind the plants relative to its light, stops."""
+    flare: float = 0.1
+    """Fraction of plots by day with lens flare, which veils the image."""
+    overlay: float = 0.12
+    """Fraction of images with thin lines, rectangles or text drawn over them in pure colours."""
+    replicated: float = 0.1
+    """Fraction of images with a strip at one side that mirrors or repeats the pixels beside it."""
 
 
 BOUNDS: dict[str, Range] = {
     **{f"scene.{name}": (0.0, 1.0) for name in ("share", "maize", "potted", "indoors", "photographs", "grass", "robot")},
-    **{f"scene.{name}": (0.0, 1.0) for name in ("borders", "shadow")},
+    **{f"scene.{name}": (0.0, 1.0) for name in ("borders", "shadow", "single", "portrait", "lone", "organs", "hanging")},
+    **{f"scene.{name}": (0.0, 1.0) for name in ("flare", "overlay", "replicated")},
     **{f"scene.{name}": (0.0, 20.0) for name in ("sun", "sky", "straw")},
     "scene.elevation": (5.0, 90.0),
     "scene.distance": (0.3, 4.0),
@@ -76,6 +99,9 @@ BOUNDS: dict[str, Range] = {
     "scene.yaw": (0.0, 75.0),
     "scene.roll": (0.0, 45.0),
     "scene.objects": (0.0, 100.0),
+    "scene.walls": (0.0, 10.0),
+    "scene.structures": (0.0, 20.0),
+    "scene.glare": (-6.0, 6.0),
     "scene.brightness": (0.01, 1.0),
     "scene.white_balance": (0.0, 1.0),
     "scene.jpeg": (5.0, 100.0),

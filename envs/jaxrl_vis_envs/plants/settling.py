@@ -17,6 +17,7 @@ _MAIZE_STALKS = {
     "sheaths": 0.85,
     "sheath_length": (0.08, 0.2),
 }
+_OF_IMAGES = ("white_balance", "borders", "overlay", "replicated")  # sampled image by image
 _MAIZE_LEAVES = {"lower": 0.25, "middle": 0.7, "upper": 0.95, "width_mean": 0.085, "length_mean": 0.75}
 
 
@@ -29,7 +30,7 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
 
     Returns:
         By night, the family with the default scene, whose share is 0. By day, a family with a share of 1, one value in each
-        range of its scene and 0 or 1 for its fractions (``borders`` apart), and its other parts adapted to these.
+        range of its scene and 0 or 1 for its fractions (those of images apart), and its other parts adapted to these.
     """
     if family.scene.share <= 0:
         return family
@@ -46,23 +47,58 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
         layout = dataclasses.replace(
             layout, stalks_mean=layout.stalks_mean * rng.uniform(0.3, 0.6), tillers=0.0, offset_sd=0.015
         )
+        stalks = dataclasses.replace(stalks, taper=stalks.taper * rng.uniform(0.6, 1.6))
     leaves, textures = _sample_ripeness(leaves, textures, rng)
-    if scene.potted:
+    if scene.indoors:
+        scene = dataclasses.replace(scene, grass=0.0)
+    if scene.lone:
+        layout = dataclasses.replace(layout, rows_behind=0)
+    width, height = family.rig.width, family.rig.height
+    focal = 0.5 * width / math.tan(math.radians(scene.lens[0]) / 2)
+    if scene.portrait:
+        width, height = height, width
+    if scene.single:
+        scene, layout, stalks, leaves, distance = _single(scene, layout, stalks, leaves, 0.5 * height / focal, rng)
+    elif scene.potted:
         layout = dataclasses.replace(layout, plot_length=0.3, stalks_mean=rng.integers(1, 3), stalks_sd=0.0, rows_behind=0)
         leaves = dataclasses.replace(leaves, litter=0.0)
         distance *= rng.uniform(1.0, 2.0)
+    # Few plants are seen from half a view's way to the side, so that the images of a plot differ.
+    stretch = 0.5 * width / focal * distance if scene.single or scene.potted else family.rig.stretch
     leaves = dataclasses.replace(leaves, litter=leaves.litter * scene.straw[0])
     rig = dataclasses.replace(
         family.rig,
-        focal=0.5 * family.rig.width / math.tan(math.radians(scene.lens[0]) / 2),
+        width=width,
+        height=height,
+        focal=focal,
         distance=distance,
         camera_height=scene.camera_height[0],
         camera_height_sd=0.0,
         distance_sd=0.0,
         pitch=scene.pitch[0],
+        stretch=stretch,
     )
     imaging = dataclasses.replace(family.imaging, flash=(0.01, 0.01))
     return _family(family, scene, layout, stalks, leaves, textures, rig, imaging)
+
+
+def _single(
+    scene: Scene, layout: Layout, stalks: Stalks, leaves: Leaves, slope: float, rng: np.random.Generator
+) -> tuple[Scene, Layout, Stalks, Leaves, float]:
+    """Sample a single plant and the distance (m) at which an image with half a view of tangent ``slope`` shows most of it."""
+    tall = rng.uniform(0.9, 2.3)
+    # From a part of the plant to a plant that is small in its image.
+    distance = float(np.clip(0.5 * tall / slope * rng.uniform(0.5, 1.6), 0.4, 4.0))
+    camera_height = float(np.clip(tall * rng.uniform(0.3, 0.8), 0.1, 2.0))
+    pitch = rng.uniform(-8.0, 12.0)
+    scene = dataclasses.replace(scene, camera_height=(camera_height, camera_height), pitch=(pitch, pitch))
+    layout = dataclasses.replace(layout, plot_length=0.3, stalks_mean=1, stalks_sd=0.0, tillers=0.0, rows_behind=0)
+    spacing = rng.uniform(0.06, 0.1) * tall
+    stalks = dataclasses.replace(stalks, height=(tall, tall), node_spacing=(0.7 * spacing, 1.3 * spacing))
+    # Seen on its own, a plant keeps the leaves that machines strip from the lower part of a row.
+    every = {"lower": rng.uniform(0.2, 1.0), "middle": rng.uniform(0.6, 1.0), "upper": 1.0}
+    leaves = dataclasses.replace(leaves, **every, density=1.0, litter=leaves.litter * rng.uniform(0.0, 0.3))
+    return scene, layout, stalks, leaves, distance
 
 
 def _family(
@@ -83,7 +119,7 @@ def _sample_ripeness(leaves: Leaves, textures: Textures, rng: np.random.Generato
 
 
 def _sample_values(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Sample one value from each range, and 0 or 1 for each fraction but ``borders``."""
+    """Sample one value from each range, and 0 or 1 for each fraction of plots."""
     drawn = {}
     for field in dataclasses.fields(scene):
         value = getattr(scene, field.name)
@@ -91,6 +127,6 @@ def _sample_values(scene: Scene, rng: np.random.Generator) -> Scene:
             low, high = value
             number = rng.uniform(low, high)
             drawn[field.name] = (number, number)
-        elif field.name != "white_balance" and field.name != "borders":
+        elif field.name not in _OF_IMAGES:
             drawn[field.name] = float(rng.random() < value)
     return dataclasses.replace(scene, **drawn | {"share": 1.0})

@@ -4,20 +4,22 @@ A backdrop is an image in azimuth and tangent of the elevation, infinitely far a
 """
 
 import importlib.util
+import math
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-SHAPE = (512, 1024)
+SHAPE = (768, 1536)
 """Height and width of a backdrop, pixels."""
 REACH = (1.6, 2.0)
 """Maximum tangent of the elevation, and maximum azimuth in rad, to either side."""
 _HORIZON = SHAPE[0] // 2
+_LEVELS = 1024  # of smooth noise
 _PHOTOGRAPHS = (("skimage", "data"), ("sklearn", "datasets/images"))
 
 
-def sample_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky: float) -> np.ndarray:
+def sample_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky: float, glare: float = 1.0) -> np.ndarray:
     """Sample a backdrop.
 
     Args:
@@ -25,6 +27,7 @@ def sample_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, s
         indoors: Sample a wall and a ceiling instead of the sky and a skyline.
         photograph: Use a photograph shipped with an installed package instead; takes precedence over ``indoors``.
         sky: Light of the sky on a white surface, which scales the radiance.
+        glare: Factor of the radiance of the sky outdoors alone: large for a white sky, small for a dark one.
 
     Returns:
         [*SHAPE, 3] float32 radiance.
@@ -34,7 +37,7 @@ def sample_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, s
     """
     if photograph:
         return (_photograph(rng) * sky * rng.uniform(0.6, 1.6)).astype(np.float32)
-    picture = _room(rng) if indoors else _outdoors(rng)
+    picture = _room(rng) if indoors else _outdoors(rng, glare)
     return (picture * sky).astype(np.float32)
 
 
@@ -46,15 +49,20 @@ def smooth_noise(rng: np.random.Generator, size: tuple[float, float], shape: tup
         size: Height and width of the features, pixels.
         shape: Height and width of the result, pixels.
     """
-    lines, columns = (np.fft.fftfreq(count)[:, None] for count in shape)
-    falloff = np.exp(-2.0 * (np.pi * size[0] * lines / 3) ** 2) * np.exp(-2.0 * (np.pi * size[1] * columns.T / 3) ** 2)
-    values = np.fft.ifft2(np.fft.fft2(rng.normal(size=shape)) * falloff).real
-    ranks = np.empty(values.size)
-    ranks[np.argsort(values, axis=None)] = np.linspace(0.0, 1.0, values.size)
-    return ranks.reshape(shape)
+    spacing = [min(max(0.6 * length, 1.0), count) for length, count in zip(size, shape)]
+    cells = [math.ceil(count / step) + 3 for count, step in zip(shape, spacing)]
+    left, top = rng.uniform(0.0, 2.0, 2)
+    box = (left, top, left + shape[1] / spacing[1], top + shape[0] / spacing[0])
+    coarse = Image.fromarray(rng.normal(size=cells).astype(np.float32))
+    values = np.asarray(coarse.resize((shape[1], shape[0]), Image.Resampling.BICUBIC, box))
+    # Ranks by histogram are as good as exact ones here, and much faster.
+    span = max(float(np.ptp(values)), 1e-6)
+    level = ((values - values.min()) * ((_LEVELS - 1) / span)).astype(np.int32)
+    ranks = np.cumsum(np.bincount(level.ravel(), minlength=_LEVELS)) / values.size
+    return ranks[level]
 
 
-def _outdoors(rng: np.random.Generator) -> np.ndarray:
+def _outdoors(rng: np.random.Generator, glare: float) -> np.ndarray:
     """Sample a sky with clouds, a ground, and one to three of: trees, a building, a crop's canopy, trunks."""
     elevation = ((_HORIZON - np.arange(SHAPE[0])) / _HORIZON * REACH[0])[:, None, None]
     zenith = np.array([0.25, 0.45, 0.95]) * rng.uniform(0.5, 1.3)
@@ -65,9 +73,13 @@ def _outdoors(rng: np.random.Generator) -> np.ndarray:
     clouds = 0.6 * smooth_noise(rng, (30, 90)) + 0.4 * smooth_noise(rng, (10, 25))
     thick = np.clip((clouds - (1.0 - cover)) / 0.25, 0.0, 1.0)[..., None]
     picture = picture + (np.array([1.0, 1.0, 1.02]) * rng.uniform(0.7, 1.8) - picture) * thick
+    picture = picture * glare
     below = np.where(rng.random() < 0.5, [0.05, 0.08, 0.03], [0.14, 0.11, 0.08]) * rng.uniform(0.5, 1.5)
     picture = np.where(elevation < 0, below * (0.6 + 0.8 * smooth_noise(rng, (4, 10))[..., None]), picture)
-    for layer in rng.permutation(["trees", "building", "canopy", "trunks"])[: rng.integers(1, 4)]:
+    layers = rng.choice(
+        ["trees", "building", "canopy", "trunks"], rng.integers(1, 4), replace=False, p=[0.35, 0.35, 0.12, 0.18]
+    )
+    for layer in layers:
         picture = {"trees": _trees, "building": _building, "canopy": _canopy, "trunks": _trunks}[layer](rng, picture)
     return picture
 
@@ -108,10 +120,10 @@ def _canopy(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
     green = np.array([0.10, 0.16, 0.04]) * rng.uniform(0.5, 1.8) * rng.uniform(0.8, 1.2, 3)
     dry = np.array([0.30, 0.24, 0.14]) * rng.uniform(0.5, 1.5)
     ripe = np.clip(smooth_noise(rng, (20, 5)) + rng.uniform(-0.7, 0.7), 0.0, 1.0)[..., None]
-    streaks = 0.25 + 1.5 * smooth_noise(rng, (rng.uniform(20, 80), rng.uniform(2, 5)))
-    leaves = 0.4 + 1.2 * smooth_noise(rng, (5, 9))
+    streaks = 0.25 + 1.5 * smooth_noise(rng, (rng.uniform(15, 80), rng.uniform(3, 9)))
+    leaves = 0.4 + 0.8 * smooth_noise(rng, (8, 14)) + 0.4 * smooth_noise(rng, (3, 5))
     texture = (streaks * leaves)[..., None]
-    gaps = (smooth_noise(rng, (12, 5)) < rng.uniform(0.0, 0.35)) & mask
+    gaps = (smooth_noise(rng, (rng.uniform(12, 40), rng.uniform(6, 16))) < rng.uniform(0.0, 0.3)) & mask
     colours = (green + (dry - green) * ripe) * texture
     return np.where((mask & ~gaps)[..., None], colours, picture)
 
@@ -119,19 +131,19 @@ def _canopy(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
 def _trunks(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
     """Paste 3 to 39 trunks or poles, 1.5 to 20 pixels wide, of random brightness and with a small random lean."""
     picture = picture.copy()
-    columns = np.arange(SHAPE[1])
     for _ in range(rng.integers(3, 40)):
         wide, at = 1.5 * (20 / 1.5) ** rng.random(), rng.uniform(0, SHAPE[1])
         top = int(_HORIZON * (1.0 - rng.uniform(0.1, 1.5) / REACH[0]))
         bottom = _HORIZON + rng.integers(2, 40)
         colour = rng.uniform(0.03, 0.6) * np.array([1.0, rng.uniform(0.8, 1.0), rng.uniform(0.6, 1.0)])
         lean = rng.normal(0.0, 0.03)
-        for line in range(max(top, 0), bottom):
-            offset = (columns - at - lean * (line - _HORIZON)) / (0.5 * wide)
-            shade = np.clip(1.0 - offset**2, 0.0, 1.0)
-            part = np.flatnonzero(shade > 0)
-            light = 0.5 + 0.8 * np.sqrt(shade[part]) * (0.8 + 0.4 * rng.random(part.size))
-            picture[line, part] = colour * light[:, None]
+        lines, sway = np.arange(max(top, 0), bottom), abs(lean) * SHAPE[0]
+        columns = np.arange(max(int(at - wide - sway), 0), min(int(at + wide + sway) + 1, SHAPE[1]))
+        offset = (columns - at - lean * (lines[:, None] - _HORIZON)) / (0.5 * wide)
+        shade = np.clip(1.0 - offset**2, 0.0, 1.0)
+        light = 0.5 + 0.8 * np.sqrt(shade) * (0.8 + 0.4 * rng.random(shade.shape))
+        part = picture[lines[0] : bottom, columns[0] : columns[-1] + 1]
+        part[shade > 0] = (colour * light[..., None])[shade > 0]
     return picture
 
 

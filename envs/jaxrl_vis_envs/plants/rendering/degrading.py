@@ -1,4 +1,4 @@
-"""Effects of simple cameras on images by day: white balance, low resolution, motion blur, JPEG, black borders.
+"""Effects of simple cameras on images by day: white balance, low resolution, motion blur, JPEG, borders, overlays.
 
 NumPy and Pillow only.
 """
@@ -8,6 +8,7 @@ import io
 import numpy as np
 from PIL import Image
 
+from jaxrl_vis_envs.plants.rendering.overlays import draw_overlay, replicate_border
 from jaxrl_vis_envs.plants.scene import Scene
 
 
@@ -20,7 +21,7 @@ def degrade(image: np.ndarray, scene: Scene, rng: np.random.Generator) -> tuple[
         rng: Random number generator; with equal seeds for both images of a pair, so that both are degraded alike.
 
     Returns:
-        The degraded image [H, W, 3] uint8, and a mask [H, W] bool, False on black borders.
+        The degraded image [H, W, 3] uint8, and a mask [H, W] bool, False on black and repeated borders.
     """
     height, width = image.shape[:2]
     gains = np.exp(scene.white_balance * rng.normal(size=3) * [1.0, 0.2, 1.0])
@@ -40,6 +41,11 @@ def degrade(image: np.ndarray, scene: Scene, rng: np.random.Generator) -> tuple[
     if rng.random() < scene.borders:
         shown = ~_border(rng, height, width)
         values[~shown] = 0
+    if rng.random() < scene.replicated:
+        values, beside = replicate_border(values, rng)
+        shown &= beside
+    if rng.random() < scene.overlay:
+        values = draw_overlay(values, rng)
     return values, shown
 
 

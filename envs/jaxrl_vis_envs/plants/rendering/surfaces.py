@@ -8,13 +8,15 @@ import numpy as np
 from jaxrl_vis_envs.plants.clutter import objects
 from jaxrl_vis_envs.plants.family import Range, Textures
 from jaxrl_vis_envs.plants.field import Leaf, Plot, Stalk, generator
+from jaxrl_vis_envs.plants.organs import sample_organs
+from jaxrl_vis_envs.plants.scene import Scene
 
 GROUND = -2
 """Label of the ground in an instance image, in which 0, 1, ... are the stalks of a plot."""
 NOTHING = -1
 """Label where nothing is within the rendered depth."""
 OBJECT = -(1 << 20)
-"""Label of round objects other than plants, such as poles."""
+"""Label of round objects that are no stalks, such as poles and ears."""
 LITTER = -3
 """Label of litter and flat objects; that of the leaves of stalk n is `LITTER` - 1 - n."""
 
@@ -72,20 +74,21 @@ def build_surfaces(plot: Plot) -> Surfaces:
     materials = [_ground(rng, textures)]
     by_day = plot.family.scene.share > 0
     if by_day:
-        materials = [_ground_by_day(rng, plot.family.scene.grass > 0, materials[0])]
+        materials = [_ground_by_day(rng, plot.family.scene, materials[0])]
     cones = []
     for index, stalk in enumerate(plot.stalks):
         cones.append(_cones(index, stalk, len(materials)))
         materials.append(_material(rng, textures, textures.stalk_hue, textures.dry_hue, (0.35, 0.7), (0.30, 0.5)))
+    organs, clasping = sample_organs(plot) if by_day else ([], [])
     strips = []
-    for leaf in plot.leaves:
+    for leaf in (*plot.leaves, *clasping):
         strips.append(_triangles(leaf, len(materials)))
         hue = textures.dry_hue if leaf.dry else textures.leaf_hue
         saturation, value = ((0.35, 0.6), (0.14, 0.34)) if leaf.dry else ((0.5, 0.75), (0.09, 0.19))
         materials.append(_material(rng, textures, hue, textures.dry_hue, saturation, value))
     if by_day:
         round_things, flat_things = objects(plot)
-        for tube, paint in round_things:
+        for tube, paint in [*round_things, *organs]:
             cones.append(_cones(OBJECT, tube, len(materials)))
             materials.append(paint)
         for ribbon, paint in flat_things:
@@ -186,35 +189,23 @@ def _material(
     ]
 
 
-def _ground_by_day(rng: np.random.Generator, grass: bool, soil: list[float]) -> list[float]:
-    """Sample the material of a ground by day: grass, or soil or concrete of any brightness."""
+def _ground_by_day(rng: np.random.Generator, scene: Scene, soil: list[float]) -> list[float]:
+    """Sample the material of a ground by day: grass, or soil or concrete of any brightness; indoors, a smooth floor."""
     place = soil[-2]
-    if grass:
-        colour = colorsys.hsv_to_rgb(rng.uniform(0.18, 0.3), rng.uniform(0.4, 0.8), rng.uniform(0.08, 0.3))
-        over = colorsys.hsv_to_rgb(rng.uniform(0.1, 0.25), rng.uniform(0.3, 0.7), rng.uniform(0.1, 0.4))
+    if scene.grass:
+        hue, saturation, value = rng.uniform(0.18, 0.3), rng.uniform(0.4, 0.8), rng.uniform(0.08, 0.3)
+        colour = colorsys.hsv_to_rgb(hue, saturation, value)
+        # Patches of a lawn are of a similar green, or dry.
+        dry = rng.uniform(0.0, 0.12) if rng.random() < 0.3 else rng.uniform(-0.02, 0.03)
+        over = colorsys.hsv_to_rgb(hue - dry, saturation * rng.uniform(0.7, 1.1), value * rng.uniform(0.75, 1.5))
         return [*colour, *over, 1 / 0.008, 0.6, 1 / 0.15, 0.4, 0.3, 1 / 0.02, 0.0, 10.0, 0.0, 0.0, place, 0.5]
-    if rng.random() < 0.3:
+    if scene.indoors or rng.random() < 0.3:
         grey = rng.uniform(0.15, 0.6)
-        return [
-            grey,
-            grey,
-            grey,
-            *([0.9 * grey] * 3),
-            1 / 0.003,
-            0.1,
-            1 / 0.3,
-            0.15,
-            0.0,
-            1 / 0.01,
-            0.0,
-            10.0,
-            0.0,
-            0.05,
-            place,
-            0.5,
-        ]
-    brightness = rng.uniform(0.6, 2.0)
-    return [brightness * channel for channel in soil[:6]] + soil[6:]
+        over = [0.9 * grey] * 3
+        return [grey, grey, grey, *over, 1 / 0.003, 0.1, 1 / 0.3, 0.15, 0.0, 1 / 0.01, 0.0, 10.0, 0.0, 0.05, place, 0.5]
+    brightness, contrast = rng.uniform(0.6, 2.0), rng.uniform(0.1, 1.0)
+    over = [base + contrast * (other - base) for base, other in zip(soil[:3], soil[3:6])]
+    return [brightness * channel for channel in (*soil[:3], *over)] + soil[6:]
 
 
 def _ground(rng: np.random.Generator, textures: Textures) -> list[float]:
