@@ -273,12 +273,12 @@ def measure_all_reduce(comparison: Comparison) -> tuple[str, Measurement]:
 def measure_in_processes(
     comparisons: list[Comparison], positions: list[int], times: list[list[float]]
 ) -> list[tuple[str, Measurement]]:
-    """Time the same training by two processes with half of the devices each; return lines of the table, and the records.
+    """Time the configurations again in two processes, each with half the devices; return the table's lines, and the records.
 
     Args:
         comparisons: Configurations to be repeated, all on the same number of devices.
         positions: Index of each among all configurations.
-        times: Times of an iteration of each by one process, s.
+        times: For each configuration, the times of an iteration in one process, s.
 
     Raises:
         SystemExit: A process failed.

@@ -47,7 +47,7 @@ def read_calibration(folder: Path) -> None:
 def read_cameras(folder: Path) -> None:
     """Read two cameras, rectified or not, from the calibration of any program, and check that numbers are finite."""
     from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import UnrectifiedPair
-    from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import read_cameras
+    from jaxrl_vis.stalks.phenotyping.io.calibrations.recognize import read_cameras
 
     files = list(folder.iterdir())
     found = read_cameras(files[0] if len(files) == 1 else folder)
@@ -58,12 +58,12 @@ def read_cameras(folder: Path) -> None:
     assert found.size is None or all(type(side) is int and 1 <= side <= 100_000 for side in found.size)
 
 
-def _recognised(path: Path) -> None:
+def _recognized(path: Path) -> None:
     from jaxrl_vis.stalks.phenotyping.io.calibrations import kitti, middlebury, ros, zed
 
     text = documents.read_text(path, 2_000_000)
     known = (middlebury.is_middlebury, kitti.is_kitti, zed.is_settings, ros.parse_printed, ros.parse_csv, ros.parse_ini)
-    if not any(recognise(text) for recognise in known):
+    if not any(recognize(text) for recognize in known):
         _storage(path)
 
 
@@ -286,7 +286,7 @@ def _pair_errors() -> tuple[type[Exception], ...]:
 _REQUEST = (RequestError,)
 READERS = {
     "calibration": Reader(read_calibration, _parses(_storage), _REQUEST),
-    "cameras": Reader(read_cameras, _parses(_recognised), _REQUEST),
+    "cameras": Reader(read_cameras, _parses(_recognized), _REQUEST),
     "plan": Reader(read_plan, _parses(_plan), _REQUEST),
     "annotations": Reader(read_any_annotations, _parses(_any_annotations), _REQUEST),
     "coco": Reader(read_annotations, _parses(documents.read_json), _REQUEST),

@@ -124,8 +124,8 @@ def _fetch_indicator() -> str:
             ("6 pixels, `--relabel-probability 0.8`: `fast`", "fetch_25_shift6rel8_indicator_10seeds"),
         ]
     )
-    heads = ["VisualFetchReach, indicator rewards, balanced and filtered"]
-    return table(heads, rows, [c.seeds(), *_at(10, 15, 20), c.names()])
+    headers = ["VisualFetchReach, indicator rewards, balanced and filtered"]
+    return table(headers, rows, [c.seeds(), *_at(10, 15, 20), c.names()])
 
 
 def _cpu() -> str:

@@ -27,15 +27,15 @@ class Row:
     cells: Sequence[str] = ()
 
 
-def table(heads: Sequence[str], rows: Sequence[Row], columns: Sequence[Column]) -> str:
+def table(headers: Sequence[str], rows: Sequence[Row], columns: Sequence[Column]) -> str:
     """Format a table as Markdown, followed by revision and device of the records, if known.
 
     Args:
-        heads: Titles of the label and of `Row.cells`.
+        headers: Titles of the label and of `Row.cells`.
         rows: Rows.
         columns: Computed columns.
     """
-    lines = [_line([*heads, *(column.title for column in columns)]), "|" + "---|" * (len(heads) + len(columns))]
+    lines = [_line([*headers, *(column.title for column in columns)]), "|" + "---|" * (len(headers) + len(columns))]
     for row in rows:
         cells = [NO_RECORD, *[""] * (len(columns) - 1)] if row.record is None else [c.cell(row.record) for c in columns]
         lines.append(_line([row.label, *row.cells, *cells]))

@@ -29,8 +29,8 @@ class Broken(AssertionError):
     """Violation of a guarantee."""
 
 
-LAST = threading.local()
-"""Thread-local output of the last process that ended, as ``lines``."""
+LAST_OUTPUT = threading.local()
+"""Thread-local output of the last process that ended, in its attribute ``lines``."""
 
 
 def environment() -> dict[str, str]:
@@ -135,7 +135,7 @@ class RunProcess:
             self.lines.append(line.rstrip())
 
     def wait(self, seconds: float = 240.0) -> int:
-        """Wait for the process and its last line, and store its output in `LAST`; return its exit status.
+        """Wait for the process and its last line, and store its output in `LAST_OUTPUT`; return its exit status.
 
         Raises:
             Broken: The process does not end in time; it is killed.
@@ -147,7 +147,7 @@ class RunProcess:
             self.popen.wait()
             raise Broken(f"did not end within {seconds:g} s: {self.lines[-3:]}") from None
         self.reader.join(5.0)
-        LAST.lines = self.lines
+        LAST_OUTPUT.lines = self.lines
         return status
 
     def send(self, number: int) -> int:

@@ -13,7 +13,7 @@ from typing import Any
 from benchmarks.soak.alone import SEPARATE_FAULTS, References, strike_alone
 from benchmarks.soak.faults import FAULTS
 from benchmarks.soak.record import Record
-from benchmarks.soak.run_process import LAST, Broken, RunProcess, kill_on_exit, list_checkpoints, read_rows
+from benchmarks.soak.run_process import LAST_OUTPUT, Broken, RunProcess, kill_on_exit, list_checkpoints, read_rows
 from jaxrl_vis.run.goodput import account, read_processes
 
 FAULTS_PER_RUN = 8
@@ -129,7 +129,7 @@ class Soak:
                 self._return_fault(FAULTS, faults.pop())
                 break
             if status not in FAULTS[fault].statuses:
-                raise Broken(f"status {status}: {LAST.lines[-4:]}")
+                raise Broken(f"status {status}: {LAST_OUTPUT.lines[-4:]}")
             spoilt |= FAULTS[fault].may_lose_rows
             if folder.exists() and not (FAULTS[fault].may_lose_rows or FAULTS[fault].goes_back):
                 self._check_nothing_lost(folder, before, good[-1][0] if good else 0)

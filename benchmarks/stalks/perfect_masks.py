@@ -9,7 +9,7 @@ import argparse
 import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.measure.stalk import measure_stalk
-from jaxrl_vis.stalks.phenotyping.measure.stereo import to_greyscale
+from jaxrl_vis.stalks.phenotyping.measure.stereo import to_grey_floats
 from jaxrl_vis_envs.plants import FAMILIES, Family, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import outline, stalks_in_view
@@ -29,7 +29,7 @@ def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]
     """
     sequence = Sequence.of(draw(family, seed))
     pair, drive = sequence[frame], sequence.drive
-    instance, left, right = np.asarray(pair.instance), to_greyscale(np.asarray(pair.left)), to_greyscale(np.asarray(pair.right))
+    instance, left, right = np.asarray(pair.instance), to_grey_floats(np.asarray(pair.left)), to_grey_floats(np.asarray(pair.right))
     rows = []
     for view in stalks_in_view(sequence.plot, pair.pose, drive.true, instance, np.asarray(pair.depth)):
         if view.band_box is None or view.band_visible < 0.3:

@@ -22,7 +22,7 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import detect, pad_image
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, resize
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
 from jaxrl_vis.stalks.phenotyping.measure.ground import find_ground
-from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, detect_with_ground, measure_pair, to_grey
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, detect_with_ground, measure_pair, to_grey_bytes
 from jaxrl_vis_envs.plants import SHIFTED, Calibration, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import stalks_in_view
@@ -72,7 +72,7 @@ if __name__ == "__main__":
         "reduced image": lambda: resize(left, settings, pixels_per_metre),
         "detector": lambda: jax.block_until_ready(detect(params["detector"], small, settings, dtype)),
         "all of finding, with masks and edges": lambda: finder(left, pixels_per_metre),
-        "ground, beside that": lambda: find_ground(to_grey(left), to_grey(right), stated),
+        "ground, beside that": lambda: find_ground(to_grey_bytes(left), to_grey_bytes(right), stated),
         "disparities and widths": lambda: measure_pair(detections, left, right, stated, ground=ground),
     }
     for name, part in parts.items():

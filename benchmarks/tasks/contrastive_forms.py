@@ -16,17 +16,17 @@ from jaxrl_vis.learner.contrastive import build, contrastive_loss
 
 def nce_stabilised(setup: Setup) -> Algorithm:
     """Build contrastive RL with binary cross-entropy, and the networks of ``stable``."""
-    return build(setup, functools.partial(contrastive_loss, form="nce"), stabilised=True)
+    return build(setup, functools.partial(contrastive_loss, form="nce"), stabilized=True)
 
 
 def infonce_plain(setup: Setup) -> Algorithm:
     """Build contrastive RL with symmetric InfoNCE, and the networks of ``nce``."""
-    return build(setup, functools.partial(contrastive_loss, form="stable"), stabilised=False)
+    return build(setup, functools.partial(contrastive_loss, form="stable"), stabilized=False)
 
 
 def balanced(setup: Setup) -> Algorithm:
     """Build contrastive RL with `balanced_loss`, and the networks of ``nce``."""
-    return build(setup, balanced_loss, stabilised=False)
+    return build(setup, balanced_loss, stabilized=False)
 
 
 def balanced_loss(logits: jax.Array) -> jax.Array:

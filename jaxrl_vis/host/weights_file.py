@@ -25,7 +25,7 @@ _KINDS = {"F16": np.float16, "F32": np.float32}
 _LOW, _SCALE = ".low", ".scale"
 _BIT_SHIFTS = np.array([0, 2, 4, 6], np.uint8)
 _LEVELS = 511
-_MIN_QUANTISED_SIZE = 4096  # minimum size of quantised arrays; smaller ones keep 16 bits, at negligible cost
+_MIN_QUANTIZED_SIZE = 4096  # minimum size of quantised arrays; smaller ones keep 16 bits, at negligible cost
 _MAX_HEADER_BYTES = 1 << 20  # bytes; our networks have headers of some 15,000
 
 Settings = TypeVar("Settings")
@@ -54,15 +54,15 @@ def write_parameters(
     arrays: dict[str, np.ndarray] = {}
     for name, leaf in _flatten(params).items():
         array = np.asarray(leaf, np.float32)
-        if bits == 10 and array.ndim > 1 and array.size >= _MIN_QUANTISED_SIZE:
-            arrays |= _quantise(name, array)
+        if bits == 10 and array.ndim > 1 and array.size >= _MIN_QUANTIZED_SIZE:
+            arrays |= _quantize(name, array)
         else:
             arrays[name] = array.astype(np.float32 if bits == 32 or name in exact else np.float16)
     _write(path, arrays, about)
 
 
-def _quantise(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
-    """Quantise an array [..., C] float32 to 10 bits per number: three arrays by name."""
+def _quantize(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
+    """Quantize an array [..., C] float32 to 10 bits per number: three arrays by name."""
     scale = np.abs(array).max(axis=tuple(range(array.ndim - 1))) / np.float32(_LEVELS)
     levels = np.round(array / np.where(scale > 0, scale, 1)).astype(np.int16)
     low = np.pad((levels & 3).ravel(), (0, -levels.size % 4)).reshape(-1, 4) << _BIT_SHIFTS
@@ -70,7 +70,7 @@ def _quantise(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _restore(high: np.ndarray, low: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Restore an array [..., C] float32 from the results of `_quantise`.
+    """Restore an array [..., C] float32 from the results of `_quantize`.
 
     Args:
         high: [..., C] int8, upper 8 bits.
@@ -121,9 +121,9 @@ def read_parameters(
             settings, shapes = declare(about)
             names = set(file.keys())
             wanted = {name: tuple(leaf.shape) for name, leaf in _flatten(shapes).items()}
-            quantised = {name for name in wanted.keys() & names if file.get_slice(name).get_dtype() == "I8"}
+            quantized = {name for name in wanted.keys() & names if file.get_slice(name).get_dtype() == "I8"}
             kinds = dict.fromkeys(wanted, ("F16", "F32"))
-            for name in quantised:
+            for name in quantized:
                 wanted |= {f"{name}{_LOW}": (-(-math.prod(wanted[name]) // 4),), f"{name}{_SCALE}": wanted[name][-1:]}
                 kinds |= {name: ("I8",), f"{name}{_LOW}": ("U8",), f"{name}{_SCALE}": ("F32",)}
             if names != wanted.keys():
@@ -140,7 +140,7 @@ def read_parameters(
             raise
         raise RequestError(f"{path} holds no weights: name a file that `{command}` wrote") from error
     # With NumPy, because JAX would compile a program for each shape.
-    for name in quantised:
+    for name in quantized:
         arrays[name] = _restore(arrays[name], arrays.pop(f"{name}{_LOW}"), arrays.pop(f"{name}{_SCALE}"))
     unsound = next((name for name, array in arrays.items() if not np.isfinite(array).all()), None)
     if unsound is not None:

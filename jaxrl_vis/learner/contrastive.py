@@ -95,16 +95,16 @@ def make(setup: Setup) -> Algorithm:
             algorithm does not support.
     """
     form = setup.config.contrastive.contrastive_form
-    return build(setup, functools.partial(contrastive_loss, form=form), stabilised=form == "stable")
+    return build(setup, functools.partial(contrastive_loss, form=form), stabilized=form == "stable")
 
 
-def build(setup: Setup, loss: Callable[[jax.Array], jax.Array], stabilised: bool) -> Algorithm:
+def build(setup: Setup, loss: Callable[[jax.Array], jax.Array], stabilized: bool) -> Algorithm:
     """Build contrastive RL with any loss of the logits.
 
     Args:
         setup: Configuration and task.
         loss: Logits [B, B] float32, as for `contrastive_loss` -> loss [] float32.
-        stabilised: True for heads with layer normalisation and cold initialisation.
+        stabilized: True for heads with layer normalisation and cold initialisation.
 
     Raises:
         RequestError: As in `make`.
@@ -112,7 +112,7 @@ def build(setup: Setup, loss: Callable[[jax.Array], jax.Array], stabilised: bool
     _check(setup)
     config = setup.config
     networks = Networks(config, setup.observation_spec, setup.action_size, 0.0)
-    policy, head = make_policy(networks), networks.head(config.contrastive.representation_size, stabilised=stabilised)
+    policy, head = make_policy(networks), networks.head(config.contrastive.representation_size, stabilized=stabilized)
     latent = networks.latent_size
 
     def init(key: jax.Array) -> Agent:

@@ -44,7 +44,7 @@ class PosedEpisodes(NamedTuple):
     goal_rotations: jax.Array
 
 
-def play_poses(acting: Acting, train: TrainState, key: jax.Array, num_envs: int) -> PosedEpisodes:
+def record_poses(acting: Acting, train: TrainState, key: jax.Array, num_envs: int) -> PosedEpisodes:
     """Roll out an episode of the first learner in each of E environments, without exploration.
 
     Args:
@@ -73,7 +73,7 @@ def write_page(program: Any, train: TrainState, key: jax.Array, episodes: int, o
     from jaxrl_vis_envs.adapters.brax_viewer import Poses, viewer_page
 
     env = program.env
-    play_all = jaxrl_vis_envs.jit(lambda train, key: play_poses(program.acting, train, key, episodes))
+    play_all = jaxrl_vis_envs.jit(lambda train, key: record_poses(program.acting, train, key, episodes))
     played = jax.tree.map(np.asarray, play_all(train, key))
     # The last step of each episode is repeated, so that its end is visible.
     hold = max(1, round(_HOLD / env.control_period))

@@ -228,7 +228,7 @@ class RunLoop:
         self._on_begun()
         self._milestones.begin()
         with self._saver.writing():
-            foreign = self._checkpoints.set_foreign_aside()
+            foreign = self._checkpoints.set_aside_foreign_runs()
             damaged = self._checkpoints.set_aside_after(self._done) if is_resumed else []
             if self._writes:
                 self._checkpoints.recent.resume_from(self._recent_at)

@@ -113,7 +113,7 @@ def set_foreign_files_aside(folder: RunFolder, checkpoints: Checkpoints) -> list
         checkpoints.run_id = read_run_id(folder.path)
     except RequestError:  # without an id, no file can be attributed
         return []
-    moved = checkpoints.set_foreign_aside()
+    moved = checkpoints.set_aside_foreign_runs()
     report = truncate_metrics(folder, checkpoints, sys.maxsize)
     return [*map(foreign_message, moved), *([report] if report else [])]
 

@@ -9,7 +9,7 @@ import pytest
 
 from jaxrl_vis import cli
 from jaxrl_vis.stalks.phenotyping.measure.stalk import measure_stalk
-from jaxrl_vis.stalks.phenotyping.measure.stereo import to_greyscale
+from jaxrl_vis.stalks.phenotyping.measure.stereo import to_grey_floats
 from jaxrl_vis_envs import plants
 from jaxrl_vis_envs.plants import SHIFTED, SHIFTS, TRAINING
 from jaxrl_vis_envs.plants.family import INCH, Family, Layout, Rig, Stalks
@@ -394,8 +394,8 @@ def test_a_pair_gives_diameters_in_millimetres(close_up):
         pair = close_up[frame]
         instance, left, right = (
             np.asarray(pair.instance),
-            to_greyscale(np.asarray(pair.left)),
-            to_greyscale(np.asarray(pair.right)),
+            to_grey_floats(np.asarray(pair.left)),
+            to_grey_floats(np.asarray(pair.right)),
         )
         for index, stalk in enumerate(close_up.plot.measured):
             line, column = np.nonzero(instance == index)

@@ -77,7 +77,7 @@ def test_off_adds_nothing() -> None:
     assert str(jax.make_jaxpr(plain.reset)(jax.random.key(0))) == str(jax.make_jaxpr(env.reset)(jax.random.key(0)))
 
 
-def test_starts_and_goals_are_not_randomised() -> None:
+def test_starts_and_goals_are_not_randomized() -> None:
     plain, varied = episodes()[0], episodes(ALL)[0]
     np.testing.assert_array_equal(varied.achieved_state, plain.achieved_state)
     np.testing.assert_array_equal(varied.goal_state, plain.goal_state)

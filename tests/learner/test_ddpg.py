@@ -325,8 +325,11 @@ def test_a_target_sums_the_rewards_of_several_steps():
 
 
 @pytest.mark.parametrize("method", ["oracle", "indicator"])
-def test_goals_that_are_reached_already_give_way(method):
-    """To what other episodes observed: points that stay where they are, each elsewhere, have reached all their own goals."""
+def test_reached_goals_are_replaced(method):
+    """Relabelled goals that are already reached are replaced by observations from other episodes.
+
+    Each point stays at its own random position, so all goals from its own episode are already reached.
+    """
 
     class Elsewhere(probes.AlwaysThere):
         def start(self, key):

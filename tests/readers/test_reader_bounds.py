@@ -119,7 +119,7 @@ def test_no_text_is_computed_and_all_of_it_comes_back(text):
     )
 
 
-def test_tables_neutralise_formulas_and_readers_know_it(tmp_path):
+def test_tables_neutralize_formulas_and_readers_know_it(tmp_path):
     formula = "=cmd|' calc'!A0"
     write_rows(tmp_path / "skipped.csv", ("plot", "pair", "why"), [{"plot": formula, "pair": "=1+1", "why": "+x"}])
     with (tmp_path / "skipped.csv").open(newline="") as file:
@@ -286,9 +286,9 @@ def test_boxes_around_runs_need_no_mask(height, width, data):
 def test_outlines_of_many_corners_are_filled_part_by_part(monkeypatch):
     angle = np.linspace(0.0, 6.28, 1000)
     corners = np.stack([32 + 20 * np.cos(angle), 24 + 15 * np.sin(7 * angle)], axis=1).ravel().tolist()
-    whole = masks.rasterise_polygons([corners], (48, 64))
+    whole = masks.rasterize_polygons([corners], (48, 64))
     monkeypatch.setattr(masks, "_CHUNK_SIZE", 500)
-    assert whole.any() and (masks.rasterise_polygons([corners], (48, 64)) == whole).all()
+    assert whole.any() and (masks.rasterize_polygons([corners], (48, 64)) == whole).all()
 
 
 # --- weights ---

@@ -63,7 +63,7 @@ def test_passes_render_meshes_as_the_plain_renderer_does(given: dict[str, str], 
 
 
 @pytest.mark.parametrize("lens", ["", ORTHOGRAPHIC], ids=["perspective", "orthographic"])
-def test_rasterisation_finds_the_triangles_that_the_plain_search_finds(lens: str) -> None:
+def test_rasterization_finds_the_triangles_that_the_plain_search_finds(lens: str) -> None:
     """In two images; the second lacks one of two meshes that coincide. One mesh is cut by the near plane."""
     scene, mj_model, poses = prepared(lens)
     later, earlier = (scene.object_ids.index(mj_model.geom(name).id) for name in ("later", "earlier"))
@@ -112,7 +112,7 @@ def test_lists_of_several_images_are_independent() -> None:
     assert np.mean(of_meshes[0] < of_meshes[1] - 1e-3) > 0.1  # without triangles, primitives and the sky remain
 
 
-def test_scenes_that_the_passes_do_not_support_are_only_rasterised() -> None:
+def test_scenes_that_the_passes_do_not_support_are_only_rasterized() -> None:
     supported = prepared(more=PANES)[0]
     assert passes.can_render(supported, FACES) and raster.can_search(supported)
     for scene in (
@@ -122,7 +122,7 @@ def test_scenes_that_the_passes_do_not_support_are_only_rasterised() -> None:
         prepared(more=9 * PANES.splitlines()[2].replace('name="bubble" ', ""))[0],
         prepared(plane_backs=True)[0],
     ):
-        assert not passes.can_render(scene, FACES) and images._fast(scene, FACES) is images._draw_rasterised
+        assert not passes.can_render(scene, FACES) and images._fast(scene, FACES) is images._draw_rasterized
     assert passes.can_render(prepared(shadows=True)[0], Outputs(rgb=False, depth=True))
     assert not passes.can_render(supported, FACES._replace(quantized=False))
 

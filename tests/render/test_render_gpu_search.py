@@ -151,7 +151,7 @@ def test_scenes_with_triangles_are_searched_by_kernels_on_a_gpu(glass: str) -> N
         with kernels(False):
             assert images._fast(scene, Outputs(rgb=True, depth=True)) is None
     with tracing_for("cpu"):
-        assert images._fast(scene, Outputs(rgb=True, depth=True)) is images._draw_rasterised
+        assert images._fast(scene, Outputs(rgb=True, depth=True)) is images._draw_rasterized
 
 
 def test_planes_seen_through_from_behind_take_the_plain_search() -> None:

@@ -68,7 +68,7 @@ def model_of(name: str, gravity: str = "0 0 -9.81") -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(_XML.format(tendon=_TENDONS[name], gravity=gravity))
 
 
-def visualised(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> list[Any]:
+def visualized(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> list[Any]:
     """The tendons' geoms of MuJoCo's visualiser."""
     scene, option, camera = mujoco.MjvScene(mj_model, 200), mujoco.MjvOption(), mujoco.MjvCamera()
     mujoco.mjv_updateScene(mj_model, mj_data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
@@ -84,7 +84,7 @@ def distances(points: np.ndarray, lines: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", _TENDONS)
-def test_capsules_and_colours_are_those_of_the_visualiser(name: str) -> None:
+def test_capsules_and_colours_are_those_of_the_visualizer(name: str) -> None:
     mj_model = model_of(name)
     scene = Scene.from_mjmodel(mj_model, "cam", 8, 8)
 
@@ -102,7 +102,7 @@ def test_capsules_and_colours_are_those_of_the_visualiser(name: str) -> None:
         mj_data.qpos[:] = qpos
         mujoco.mj_forward(mj_model, mj_data)
         states.append({part: np.array(getattr(mj_data, part)) for part in ("site_xpos", "geom_xpos", "geom_xmat")})
-        theirs.append(visualised(mj_model, mj_data))
+        theirs.append(visualized(mj_model, mj_data))
     capsules, colours = compute(jax.tree.map(lambda *rows: jnp.asarray(np.stack(rows), jnp.float32), *states))
     assert (capsules is None) == (name == "fixed") == (not any(theirs))
     for index, geoms in enumerate(theirs if capsules is not None else ()):
@@ -129,7 +129,7 @@ def test_both_courses_occur_in_the_poses() -> None:
             mj_data = mujoco.MjData(mj_model)
             mj_data.qpos[:] = qpos
             mujoco.mj_forward(mj_model, mj_data)
-            seen.add(len(visualised(mj_model, mj_data)))
+            seen.add(len(visualized(mj_model, mj_data)))
     assert all(max(numbers[name]) > 2 for name in names[:3] + names[4:6]), numbers
     assert all(1 in numbers[name] for name in ("ball_beside", "rod", "rod_beside")), numbers
     assert {1, 2} == numbers["ball_inside"] and {1, 28} == numbers["hanging"], numbers

@@ -103,7 +103,7 @@ def test_the_page_shows_the_episodes_that_the_video_shows(tmp_path):
     program = make_train_step(env, preset("debug", **settings))
     trains = program.init(jax.random.key(0)[None]).train
     key = jax.random.key(5)
-    posed = jax.jit(lambda trains: viewer.play_poses(program.acting, trains, key, 3))(trains)
+    posed = jax.jit(lambda trains: viewer.record_poses(program.acting, trains, key, 3))(trains)
     played = jax.jit(lambda trains: play(program.acting, trains, key[None], 3).episodes)(trains)
     episodes = jax.tree.map(lambda leaf: leaf[0], played)
     np.testing.assert_allclose(posed.positions[..., 0, :1], episodes.states[:, :-1], atol=1e-6)

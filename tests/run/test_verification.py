@@ -84,7 +84,7 @@ def test_a_run_that_nobody_touched_is_equal_and_stays_as_it_is(copy, verified):
     before = contents(copy)
     report = verified(copy)
     assert report.is_equal and report.problems == []
-    assert not any(" then, " in line for line in report.elsewhere)
+    assert not any(" then, " in line for line in report.caveats)
     # Two evaluations from the seed, one from full/6; and the states on the way.
     assert report.rows == 6 and report.checkpoints == ["light/8", "full/8"]
     assert contents(copy) == before
@@ -216,7 +216,7 @@ def test_what_is_missing_contradicts_or_is_foreign_is_said(copy, verified):
     problems = "; ".join(report.problems)
     assert "preset is 'paper' above and 'debug' in the configuration" in problems
     assert "curve.png is missing" in problems and "full/7 says that it is of iteration 6" in problems
-    assert any(line.startswith("jax 0.1 then, ") for line in report.elsewhere)
+    assert any(line.startswith("jax 0.1 then, ") for line in report.caveats)
     shutil.rmtree(copy / "checkpoints")
     assert "checkpoints are missing: the run has come to iteration 8" in "; ".join(verified(copy).problems)
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.tables.field_plan import missing_plots, read_field_plan
+from jaxrl_vis.stalks.phenotyping.io.tables.field_plan import missing_plots_message, read_field_plan
 from jaxrl_vis.stalks.phenotyping.report.exchange import TRAITS, replace_terms, write_exchange
 from jaxrl_vis.stalks.phenotyping.report.tables import PLOT_COLUMNS
 
@@ -149,8 +149,8 @@ def test_rows_of_a_plan_are_those_of_folders(tmp_path, form):
     columns, plan = read_field_plan(tmp_path / "plan.csv", PLOTS)
     assert "range" in columns and "genotype" in columns
     assert [(plan[plot]["range"], plan[plot]["genotype"]) for plot in PLOTS] == [("1", "A"), ("2", "B")]
-    assert missing_plots(plan, PLOTS) is None
-    assert missing_plots(plan, [*PLOTS, "c"]) == "the plan of the field does not name c"
+    assert missing_plots_message(plan, PLOTS) is None
+    assert missing_plots_message(plan, [*PLOTS, "c"]) == "the plan of the field does not name c"
 
 
 def test_ranges_and_rows_name_plots(tmp_path):

@@ -14,7 +14,7 @@ from jaxrl_vis import cli
 from jaxrl_vis.host.worker_pool import replace_non_finite
 from jaxrl_vis.stalks.cli.options import PlantOptions
 from jaxrl_vis.stalks.grasping.evaluation.records import Conditions, evaluate_run
-from jaxrl_vis.stalks.grasping.evaluation.scoring import draw_scene, score_scene, summarise_scores
+from jaxrl_vis.stalks.grasping.evaluation.scoring import draw_scene, score_scene, summarize_scores
 from jaxrl_vis.stalks.grasping.evaluation.truth_on_disk import find_truth
 from jaxrl_vis.stalks.grasping.perception.cloud import Mount
 from jaxrl_vis.stalks.grasping.perception.perceive import DEFAULT_VARIANT, THESIS_VARIANT, Variant
@@ -196,7 +196,7 @@ def test_masks_are_compared_with_the_truth_and_the_figure_is_drawn(spec, tmp_pat
     score, perception = score_scene(scene, lambda image, number: np.roll(scene.masks[number], 1, axis=1))
     assert score.mask is not None and 0.3 < score.mask.boundary < 1.5
     assert 0.6 < 2.0 * score.mask.hits / (score.mask.painted + score.mask.true) < 0.97
-    assert summarise_scores([score])["mask_f1"] < 1.0 and len(perception.clouds) == 3
+    assert summarize_scores([score])["mask_f1"] < 1.0 and len(perception.clouds) == 3
     thesis, _ = score_scene(scene, None, THESIS_VARIANT)
     assert thesis.mask is None and np.median(thesis.stitches) > np.median(score.stitches)
     mixed, _ = score_scene(scene, None, Variant(points=True))

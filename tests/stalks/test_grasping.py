@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from jaxrl_vis.stalks.grasping.evaluation.scoring import RunScore, match_stalks, stitch_error, summarise_scores, true_motion
+from jaxrl_vis.stalks.grasping.evaluation.scoring import RunScore, match_stalks, stitch_error, summarize_scores, true_motion
 from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, build_cloud, compute_disparity, redness, subsample
 from jaxrl_vis.stalks.grasping.perception.lines import detect_grasp_points
 from jaxrl_vis.stalks.grasping.perception.perceive import View, perceive
@@ -293,11 +293,11 @@ def test_figures_of_runs():
         RunScore(0, 8, 8, np.array([1.0] * 7), np.array([0.5, 1.5]), 0, seconds, None, ()),
         RunScore(1, 2, 2, np.array([3.0, 5.0]), np.array([2.5]), 1, seconds, None, ("a note",)),
     ]
-    figures = summarise_scores(scores)
+    figures = summarize_scores(scores)
     assert figures["f1"] == pytest.approx(18 / 20) and figures["precision"] == figures["recall"] == pytest.approx(0.9)
     assert figures["point_median_mm"] == 1.0 and figures["stitch_median_mm"] == 1.5 and figures["stitches_refused"] == 1
     assert figures["seconds_per_pair"] == pytest.approx(0.3)
-    assert math.isnan(summarise_scores([])["f1"])
+    assert math.isnan(summarize_scores([])["f1"])
 
 
 # --- masks ---

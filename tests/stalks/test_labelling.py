@@ -14,7 +14,7 @@ from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.detector.weights import write_weights
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
-from jaxrl_vis.stalks.phenotyping.io.masks import rasterise_polygons
+from jaxrl_vis.stalks.phenotyping.io.masks import rasterize_polygons
 from jaxrl_vis.stalks.phenotyping.report.proposals import outline, write_coco, write_labelme
 
 SIZE = (120, 100)
@@ -36,7 +36,7 @@ def test_outlines_enclose_the_pixels_of_masks(leaning):
     found, mask = leaning
     corners = outline(found)
     assert len(corners) < 80  # not one for each line
-    drawn = rasterise_polygons([corners], SIZE)
+    drawn = rasterize_polygons([corners], SIZE)
     assert (drawn & mask).sum() / (drawn | mask).sum() > 0.94
     assert abs(int(drawn.sum()) - int(mask.sum())) < 0.02 * mask.sum()
     empty = Detection((9.5, 19.5, 19.5, 99.5), (14.0, 14.0), 0.9, np.zeros((10, 10), np.float32), (30, 8))
@@ -52,7 +52,7 @@ def test_proposals_are_read_as_annotations(leaning, tmp_path):
     (annotation,) = read["annotations"]
     assert len(read["images"]) == 2 and "stalk (1)" in read["summary"]
     np.testing.assert_allclose(annotation["bbox"], [44, 20, 24, 80], atol=1.1)
-    assert (rasterise_polygons(annotation["segmentation"], SIZE) & mask).sum() > 0.96 * mask.sum()
+    assert (rasterize_polygons(annotation["segmentation"], SIZE) & mask).sum() > 0.96 * mask.sum()
     written = json.loads((tmp_path / "annotations.json").read_text())
     assert {"id", "image_id", "category_id", "bbox", "area", "iscrowd", "segmentation"} <= written["annotations"][0].keys()
     assert written["annotations"][0]["area"] == pytest.approx(mask.sum(), rel=0.02)

@@ -18,7 +18,7 @@ from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.calibration import write_calibration
-from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask, rasterise_polygons
+from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask, rasterize_polygons
 from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, fit_settings
 from jaxrl_vis.stalks.phenotyping.training.detector_training import OUTPUTS
 from jaxrl_vis_envs.plants import Calibration
@@ -265,7 +265,7 @@ def test_masks_of_strips_are_as_wide_as_the_strips():
         top, tall = rng.uniform(5, 15), 120.0
         right = left + wide
         outline = [left, top, right, top, right + lean * tall, top + tall, left + lean * tall, top + tall]
-        runs = rasterise_polygons([outline], (160, 200)).sum(axis=1)[20:120]
+        runs = rasterize_polygons([outline], (160, 200)).sum(axis=1)[20:120]
         errors.append(runs.mean() - wide)
     assert abs(np.mean(errors)) < 0.02 and np.std(errors) < 0.1
 
@@ -293,8 +293,8 @@ def test_masks_of_outlines_agree_with_boxes_and_runs(tmp_path):
 def test_outlines_beyond_the_image_and_of_several_parts():
     inside = np.zeros((10, 12), bool)
     inside[:4, :5] = True
-    np.testing.assert_array_equal(rasterise_polygons([[-7, -3, 5, -3, 5, 4, -7, 4]], (10, 12)), inside)
+    np.testing.assert_array_equal(rasterize_polygons([[-7, -3, 5, -3, 5, 4, -7, 4]], (10, 12)), inside)
     inside[6:, 9:] = True
     parts = [[-7, -3, 5, -3, 5, 4, -7, 4], [0, 0, 3, 0, 3, 3, 0, 3], [9, 6, 30, 6, 30, 30, 9, 30]]
-    np.testing.assert_array_equal(rasterise_polygons(parts, (10, 12)), inside)  # parts that overlap are no holes
-    assert not rasterise_polygons([[20, 20, 30, 20, 30, 30]], (10, 12)).any()
+    np.testing.assert_array_equal(rasterize_polygons(parts, (10, 12)), inside)  # parts that overlap are no holes
+    assert not rasterize_polygons([[20, 20, 30, 20, 30, 30]], (10, 12)).any()

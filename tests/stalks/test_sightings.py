@@ -9,7 +9,7 @@ import pytest
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
-from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, average_precision, match_detections, summarise_scores
+from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, average_precision, match_detections, summarize_scores
 from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean_widths
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read_odometries, read_odometry
@@ -368,14 +368,14 @@ def test_average_precision_and_the_figures_of_plots():
         ),
         PlotScore(1, 40, 41, np.zeros((0, 2)), np.zeros((0, 2)), 1),
     ]
-    figures = summarise_scores(scores)
+    figures = summarize_scores(scores)
     assert figures["count_r2"] == pytest.approx(1.0 - 2.0 / 50.0) and figures["count_mae"] == 1.0
     assert figures["width_mae_mm"] == pytest.approx(0.75) and figures["width_bias_mm"] == pytest.approx(0.25)
     assert figures["width_coverage_95"] == 0.5  # 1 mm beside, of 0.98, and 0.5 of 0.59
     assert figures["precision"] == 1.0 and figures["recall"] == pytest.approx(1 / 3)
     # Both finds, of scores .9 and .2, are right; one stalk of three is found by none.
     assert figures["f1_best"] == pytest.approx(0.8) and figures["f1_best_least_score"] == 0.2
-    assert np.isnan(summarise_scores([])["f1"])
+    assert np.isnan(summarize_scores([])["f1"])
 
 
 def test_the_thesis_counts_by_length_and_takes_means():

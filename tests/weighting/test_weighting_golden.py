@@ -304,7 +304,7 @@ def test_auxinash_bargains_with_learned_preferences() -> None:
     np.testing.assert_allclose(gramian @ weights * weights, shares, rtol=1e-9)
 
     def decrease(shares: np.ndarray) -> float:
-        """Of loss b, per unit of step size."""
+        """Return the decrease of loss b per unit of step size."""
         return float(gramian[1] @ np.asarray(solvers.bargain(jnp.asarray(gramian), jnp.asarray(shares))))
 
     slopes = np.array([(decrease(shares + 1e-5 * mode) - decrease(shares - 1e-5 * mode)) / 2e-5 for mode in np.eye(3)])

@@ -205,9 +205,9 @@ class Learner:
         images = replay.observations[torch.cat([start + time, wanted, reached])]
         distance = torch.linalg.vector_norm(replay.states[reached] - replay.states[wanted], dim=1)
         reward = torch.where(distance <= rules.threshold, rules.reward_positive, rules.reward_negative)
-        return self._normalised(images), replay.actions[episode * rules.horizon + time], reward
+        return self._normalized(images), replay.actions[episode * rules.horizon + time], reward
 
-    def _normalised(self, images: Any) -> Any:
+    def _normalized(self, images: Any) -> Any:
         before, goal, after = images.chunk(3)
         (mean, scale), (goal_mean, goal_scale) = self.statistics
         goal = self._as_goal(goal)

@@ -136,7 +136,7 @@ def _fast(scene: Scene, outputs: Outputs) -> Callable[..., Planes] | None:
         if path.can_render(scene, outputs):
             return path.draw
     if raster.can_search(scene):
-        return _draw_rasterised
+        return _draw_rasterized
     return _draw_walking if search.can_search(scene) else None
 
 
@@ -169,7 +169,7 @@ def _draw_walking(
     return _draw(outputs, scene, rotation, unit, light_table, _BY_KERNELS)
 
 
-def _draw_rasterised(
+def _draw_rasterized(
     outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
 ) -> Planes:
     """Render as `_draw`, with the nearest triangles found by rasterisation."""

@@ -82,7 +82,8 @@ class Scene:
         cords: [ntendon, 15] float32, lengths, limits and gravity of tendons, see `model.tendons`.
         texels: [T, 4] uint32, all textures at all mipmap levels, see `textures.Atlas`.
         triangles: [R, 36] float32, triangles of all meshes and height fields, see `meshes.build_triangles`.
-        clusters: [K, 8] float32, bounding spheres (metres) and cones of normals of the rendered triangle clusters, see there.
+        clusters: [K, 8] float32, bounding spheres (metres) and cones of normals of the rendered triangle clusters, see
+            `meshes.build_triangles`.
         cluster_places: [K, 2] int32: index of the cluster's object among the G, and first row of its triangles.
         hierarchies: Hierarchies over the triangles, see `hierarchies.Hierarchies`; None in a scene without triangles.
         object_ids: G indices of the rendered objects (a tendon's once for each of its capsules), in the reverse of MuJoCo's

@@ -121,13 +121,13 @@ def _ball(polar: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
 
 
 def _closed(surface_point: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Make a surface with the topology of a ball: two poles, and rings between them.
+    """Make a closed surface with the topology of a sphere: two poles, and rings of vertices between them.
 
     Args:
         surface_point: Function from polar angles and azimuths [N] to points [N, 3].
 
     Returns:
-        Corners [V, 3] float64, of any size, and triangles [F, 3] int32, counterclockwise from outside.
+        Vertices [V, 3] float64, not yet scaled, and triangles [F, 3] int32, counterclockwise from outside.
     """
     polar, azimuth = np.meshgrid(
         np.pi * np.arange(1, _ALONG + 1) / (_ALONG + 1), 2.0 * np.pi * np.arange(_AROUND) / _AROUND, indexing="ij"

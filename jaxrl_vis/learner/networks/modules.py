@@ -114,7 +114,7 @@ class Head(nn.Module):
         outputs: Number of outputs.
         output_bias: Initial bias of the outputs.
         dtype: Dtype of the hidden layers; the last layer is float32.
-        stabilised: Whether hidden layers are normalised (layer normalisation) and outputs are initially close to
+        stabilized: Whether hidden layers are normalised (layer normalisation) and outputs are initially close to
             ``output_bias`` (Zheng et al., 2024, arXiv 2306.03346).
     """
 
@@ -122,17 +122,17 @@ class Head(nn.Module):
     outputs: int
     output_bias: float
     dtype: Any
-    stabilised: bool = False
+    stabilized: bool = False
 
     @nn.compact
     def __call__(self, *inputs: jax.Array) -> jax.Array:
         """Apply the layers to the concatenation of ``inputs`` along the last axis: [B, outputs] float32."""
         for layer, size in enumerate(self.hidden_sizes):
             values = Dense(size, self.dtype, name=f"hidden_{layer}")(*inputs)
-            if self.stabilised:
+            if self.stabilized:
                 values = nn.LayerNorm(dtype=self.dtype, name=f"normalization_{layer}")(values)
             inputs = (nn.relu(values),)
         # The last layer stays in float32: near Q = -50 the spacing of bfloat16 numbers is 0.25.
         bias = nn.initializers.constant(self.output_bias)
-        kernel = _zero_init if self.stabilised else _glorot
+        kernel = _zero_init if self.stabilized else _glorot
         return Dense(self.outputs, jnp.float32, bias, kernel, name="output")(*inputs)

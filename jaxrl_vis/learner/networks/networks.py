@@ -181,9 +181,9 @@ class Networks:
     def _encoder(self) -> Any:
         return Encoder(self.config.network.encoder_filters, self.config.network.latent_size, self.dtype)
 
-    def head(self, outputs: int, output_bias: float = 0.0, stabilised: bool = False) -> Any:
+    def head(self, outputs: int, output_bias: float = 0.0, stabilized: bool = False) -> Any:
         """Build a head with the configured hidden layers, a flax module (`modules.Head`); arguments as there."""
-        return Head(self.config.network.hidden_sizes, outputs, output_bias, self.dtype, stabilised)
+        return Head(self.config.network.hidden_sizes, outputs, output_bias, self.dtype, stabilized)
 
     @property
     def latent_size(self) -> int:

@@ -14,7 +14,7 @@ from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run.exported import contract as contracts
 from jaxrl_vis.run.exported import golden, onnx_file, stablehlo
 from jaxrl_vis.run.exported.contract import FORMATS, TOLERANCE, Contract
-from jaxrl_vis.run.exported.layers import COMPUTATION, INPUTS, Layers, forward, layers_of
+from jaxrl_vis.run.exported.layers import COMPUTATION, INPUTS, PolicyWeights, forward, layers_of
 from jaxrl_vis.run.storage.folder import EXPORT_FOLDER
 from jaxrl_vis.run.trained.policy import Policy, choose_seed, make_policy
 from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
@@ -115,7 +115,7 @@ def _input_ranges(policy: Policy) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def _write(
-    folder: Path, kind: str, policy: Policy, layers: Layers | None, frames: golden.Golden, contract: dict[str, Any]
+    folder: Path, kind: str, policy: Policy, layers: PolicyWeights | None, frames: golden.Golden, contract: dict[str, Any]
 ) -> None:
     """Write the files, the contract last, so that an interrupted export has no contract. ``layers`` is None for StableHLO.
 
@@ -203,11 +203,11 @@ def _load_weights(contract: Contract) -> Any:
             if not all(isinstance(size, int) and size > 0 for size in shape):
                 raise ValueError(name)
             shapes[name] = np.broadcast_to(np.float32(0), shape)  # a view, of any size
-        return limit, Layers(limit, shapes).nested()
+        return limit, PolicyWeights(limit, shapes).nested()
 
     params, limit, about = read_parameters(contract.file, "jaxrl-vis export", declare)
     arrays = {name: np.asarray(_leaf(params, name)) for name in about["contract"]["network"]["shapes"]}
-    layers = Layers(limit, arrays)
+    layers = PolicyWeights(limit, arrays)
     return lambda observation, goal: forward(layers, observation, goal)
 
 

@@ -35,7 +35,7 @@ COMPUTATION = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Layers:
+class PolicyWeights:
     """Weights of a policy.
 
     Attributes:
@@ -76,7 +76,7 @@ class Layers:
         return tree
 
 
-def layers_of(policy: Policy) -> Layers:
+def layers_of(policy: Policy) -> PolicyWeights:
     """Collect the layers of a policy.
 
     Raises:
@@ -91,7 +91,7 @@ def layers_of(policy: Policy) -> Layers:
     return collect(networks, params)
 
 
-def collect(networks: Networks, params: PolicyParams) -> Layers:
+def collect(networks: Networks, params: PolicyParams) -> PolicyWeights:
     """Collect the layers of a policy of given networks."""
     arrays: dict[str, Any] = {}
     options = networks.config.network
@@ -111,10 +111,10 @@ def collect(networks: Networks, params: PolicyParams) -> Layers:
         arrays |= {f"head/{layer}/{part}": leaf for part, leaf in params.actor["head"][f"hidden_{layer}"].items()}
     arrays |= {f"head/output/{part}": leaf for part, leaf in params.actor["head"]["output"].items()}
     host = {name: np.ascontiguousarray(jax.device_get(array), np.float32) for name, array in arrays.items()}
-    return Layers(float(options.normalizer_clip), host)
+    return PolicyWeights(float(options.normalizer_clip), host)
 
 
-def forward(layers: Layers, observation: np.ndarray, goal: np.ndarray) -> np.ndarray:
+def forward(layers: PolicyWeights, observation: np.ndarray, goal: np.ndarray) -> np.ndarray:
     """Compute actions in NumPy.
 
     Args:

@@ -1,4 +1,4 @@
-"""Policies as ONNX: the graph is written node by node from `Layers`, and run by onnxruntime. Both are the extra ``export``."""
+"""Policies as ONNX: the graph is written node by node from `PolicyWeights`, and run by onnxruntime. Both are the extra ``export``."""
 
 import importlib
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.provenance import install_command
-from jaxrl_vis.run.exported.layers import INPUTS, OUTPUT, Layers
+from jaxrl_vis.run.exported.layers import INPUTS, OUTPUT, PolicyWeights
 
 # Old enough for runtimes of 2022, including browsers.
 _OPSET, _IR_VERSION = 17, 8
@@ -43,12 +43,12 @@ class _Graph:
         self.nodes.append(self._onnx.helper.make_node(operation, inputs, [output], name=output, **attributes))
         return output
 
-    def dense(self, values: str, layers: Layers, name: str, output: str) -> str:
+    def dense(self, values: str, layers: PolicyWeights, name: str, output: str) -> str:
         kernel, bias = (self.constant(f"{name}/{part}", layers.arrays[f"{name}/{part}"]) for part in ("kernel", "bias"))
         return self.node("Gemm", [values, kernel, bias], output)
 
 
-def to_bytes(layers: Layers, shape: tuple[int, ...], dtype: np.dtype, about: str = "") -> bytes:
+def to_bytes(layers: PolicyWeights, shape: tuple[int, ...], dtype: np.dtype, about: str = "") -> bytes:
     """Write a policy as an ONNX model: observation and goal [batch, ...] -> action [batch, A] float32.
 
     Args:
@@ -81,7 +81,7 @@ def to_bytes(layers: Layers, shape: tuple[int, ...], dtype: np.dtype, about: str
     return model.SerializeToString()
 
 
-def _latent(graph: _Graph, onnx: Any, layers: Layers, name: str) -> str:
+def _latent(graph: _Graph, onnx: Any, layers: PolicyWeights, name: str) -> str:
     """Add the normalisation and the encoder of one input; return the name of its latent [batch, latent]."""
     source = layers.scaling(name)
     mean, scale = (graph.constant(f"{source}/{part}", layers.arrays[f"{source}/{part}"]) for part in ("mean", "scale"))

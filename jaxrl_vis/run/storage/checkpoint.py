@@ -61,7 +61,7 @@ class Checkpoints:
         read_only: Whether to only read: nothing is saved, created or cleaned up.
 
     Attributes:
-        run_id: Id of the run: other runs' checkpoints are ignored, except by `set_foreign_aside`. `ANY_RUN`: all checkpoints.
+        run_id: Id of the run: other runs' checkpoints are ignored, except by `set_aside_foreign_runs`. `ANY_RUN`: all checkpoints.
         recent: Recent states of the run.
     """
 
@@ -292,12 +292,12 @@ class Checkpoints:
         later = {tier: [number for number in iterations if number > iteration] for tier, iterations in tiers.items()}
         return self._move(later, DAMAGED)
 
-    def set_foreign_aside(self) -> list[Path]:
+    def set_aside_foreign_runs(self) -> list[Path]:
         """Move checkpoints of other runs to checkpoints/foreign/, where they are not counted; return their new paths."""
         foreign = {tier: [number for number, is_ours in self._list(tier) if not is_ours] for tier in (LIGHT, FULL, BEST)}
         moved = self._move(foreign, FOREIGN)
         recent = _unused_path(self._folder / FOREIGN / RECENT)
-        if distributed.is_first() and self.recent.set_foreign_aside(recent):
+        if distributed.is_first() and self.recent.set_aside_foreign_runs(recent):
             moved.append(recent)
         return moved
 

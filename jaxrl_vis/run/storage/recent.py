@@ -54,7 +54,7 @@ class Recent:
         echo: Called with one line when there is no more space for them.
 
     Attributes:
-        run_id: Id of the run: other runs' states are ignored, except by `set_foreign_aside`. `ANY_RUN`:
+        run_id: Id of the run: other runs' states are ignored, except by `set_aside_foreign_runs`. `ANY_RUN`:
             all states.
     """
 
@@ -83,7 +83,7 @@ class Recent:
         except Unusable:
             return True
 
-    def set_foreign_aside(self, to: Path) -> bool:
+    def set_aside_foreign_runs(self, to: Path) -> bool:
         """Move the folder with all states to ``to`` if one of them is of another run; return True if so."""
         is_foreign = any(not self._is_ours(iteration) for iteration in _numbers(self._folder, "state"))
         if is_foreign:

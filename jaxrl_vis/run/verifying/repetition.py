@@ -35,7 +35,8 @@ class Verification(Findings):
         differences: Lines about rows and checkpoints that differ from the repetition; also among the problems.
         largest: The largest relative difference of a number.
         unverified: Lines about parts that were not repeated, and why.
-        elsewhere: Differences of this machine or its software from the run's, for which bit equality is not guaranteed.
+        caveats: Reasons why bit equality is not guaranteed: another machine, other software or devices, or an unknown or
+            modified revision.
     """
 
     rows: int = 0
@@ -44,7 +45,7 @@ class Verification(Findings):
     differences: list[str] = dataclasses.field(default_factory=list)
     largest: float = 0.0
     unverified: list[str] = dataclasses.field(default_factory=list)
-    elsewhere: list[str] = dataclasses.field(default_factory=list)
+    caveats: list[str] = dataclasses.field(default_factory=list)
 
     @property
     def is_equal(self) -> bool:

@@ -79,7 +79,7 @@ def verify_run(
     check_record(record, config, findings)
     devices = jax.local_device_count()
     if config.run.devices > devices:
-        findings.elsewhere.append(f"the run was on {config.run.devices} devices, and is repeated on one")
+        findings.caveats.append(f"the run was on {config.run.devices} devices, and is repeated on one")
         config = config.replace(devices=1, data_devices=None)
     trainer = make_trainer(config, cache_programs=cache_programs)
     return verify(trainer, path, record, iterations, findings, echo)
@@ -163,13 +163,13 @@ class _Verifier:
         where = f"{device.get('count')} {device.get('kind')}, {device.get('cpu_count')} cores"
         self._echo(f"made by revision {recorded['revision'] or 'unknown'}, {libraries or 'unknown versions'}, on {where}")
         changed = [name for name in recorded if recorded[name] != current.get(name)]
-        report.elsewhere += [f"{name} {recorded[name]} then, {current.get(name)} now" for name in changed]
+        report.caveats += [f"{name} {recorded[name]} then, {current.get(name)} now" for name in changed]
         if recorded["revision"] is None:
-            report.elsewhere.append("config.json names no revision")
+            report.caveats.append("config.json names no revision")
         elif str(recorded["revision"]).endswith("-dirty"):
-            report.elsewhere.append("the revision had uncommitted changes")
+            report.caveats.append("the revision had uncommitted changes")
         if current["platform"] != "cpu":
-            report.elsewhere.append("equal numbers are guaranteed only on a CPU")
+            report.caveats.append("equal numbers are guaranteed only on a CPU")
 
     # -- Checkpoints
 

@@ -113,7 +113,7 @@ def evaluate(options: Eval) -> int:
     table = records.evaluate_runs(conditions, numbers, options.json, started, _print_run)
     print(f"simulated runs of family {family.name}, masks: {name}, {variant}:")
     perceived = [{**table.records[number], "reaches": {}} for number in numbers]
-    for figure, value in records.summarise(perceived).items():
+    for figure, value in records.summarize(perceived).items():
         print(f"  {figure:20} {f'{value:.4f}' if isinstance(value, float) else value}")
     if options.reach:
         _reach_all(options, table, numbers)
@@ -162,10 +162,10 @@ def _load_policy(options: Eval) -> "tuple[Policy | None, str]":
 def _print_run(number: int, record: Record) -> None:
     """Print one line with the scores of a run."""
     from jaxrl_vis.stalks.grasping.evaluation import records
-    from jaxrl_vis.stalks.grasping.evaluation.scoring import summarise_scores
+    from jaxrl_vis.stalks.grasping.evaluation.scoring import summarize_scores
 
     score = records.read_score(record)
-    one = summarise_scores([score])
+    one = summarize_scores([score])
     print(
         f"run {number}: {len(score.errors)} of {score.true} stalks, {score.detected - len(score.errors)} false, "
         f"grasp points {one['point_median_mm']:.1f} mm, stitches {one['stitch_median_mm']:.1f} mm"

@@ -98,7 +98,7 @@ def _evaluate(options: Eval, families: "Mapping[str, Family]", weights: Path | N
             print(f"evaluated before: {count} of {len(tasks) * options.plots} plots, in {options.json}", flush=True)
 
     def done(factor: str, seed: int, record: Record) -> None:
-        one = records.summarise(options.min_score, [record])
+        one = records.summarize(options.min_score, [record])
         print(
             f"{factor} plot {seed}: {record['counted']} of {record['true']} stalks, ".lstrip()
             + f"width error {one['width_mae_mm']:.2f} mm, F1 {one['f1']:.3f}",

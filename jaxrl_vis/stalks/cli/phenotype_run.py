@@ -69,7 +69,7 @@ def run(options: Run) -> int:
     check_extra("phenotyping")
     check_writable(options.out, "--out", folder=True)
     from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE
-    from jaxrl_vis.stalks.phenotyping.io.tables.field_plan import missing_plots, read_field_plan
+    from jaxrl_vis.stalks.phenotyping.io.tables.field_plan import missing_plots_message, read_field_plan
     from jaxrl_vis.stalks.phenotyping.report.exchange import replace_terms, write_exchange
 
     traits = replace_terms(options.term)
@@ -78,7 +78,7 @@ def run(options: Run) -> int:
         print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
     calibrations = {plot.name: options.read_calibration(plot) for plot in plots}
     columns, plan = ([], {}) if options.field is None else read_field_plan(options.field, [plot.name for plot in plots])
-    said = None if options.field is None else missing_plots(plan, [plot.name for plot in plots])
+    said = None if options.field is None else missing_plots_message(plan, [plot.name for plot in plots])
     if said is not None:
         print(f"{options.field}: {said}", file=sys.stderr)
     if options.workers > 1:

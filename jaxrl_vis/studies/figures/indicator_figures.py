@@ -75,9 +75,9 @@ def _tables(lines: Mapping[tuple[str, str], Line], tasks: Sequence[str]) -> tupl
         text += [f"### {task}", "", table_row(columns), table_row(["---"] * len(columns))]
         for (of_task, variant), line in lines.items():
             if of_task == task:
-                figures = _figures(line)
-                text.append(table_row([VARIANTS[variant].label, *_cells(figures)]))
-                names = {f"{name}{end}": value for name, values in figures.items() for end, value in _csv(values)}
+                statistics = _statistics(line)
+                text.append(table_row([VARIANTS[variant].label, *_cells(statistics)]))
+                names = {f"{name}{end}": value for name, values in statistics.items() for end, value in _csv(values)}
                 rows.append(dict(task=task, method=variant, seeds=len(line.seeds), env_steps=line.end, **names))
         text.append("")
     return text, rows
@@ -86,7 +86,7 @@ def _tables(lines: Mapping[tuple[str, str], Line], tasks: Sequence[str]) -> tupl
 Quartiles = tuple[float, float, float]
 
 
-def _figures(line: Line) -> dict[str, Quartiles | float]:
+def _statistics(line: Line) -> dict[str, Quartiles | float]:
     """Compute quartiles over seeds of evaluation metrics, and medians of reward statistics."""
     filtered = _mean(line, _FILTERED)
     return {
@@ -116,9 +116,9 @@ def _last(line: Line, metric: str) -> float:
     return float(np.median(values[np.isfinite(values)])) if np.isfinite(values).any() else float("nan")
 
 
-def _cells(figures: Mapping[str, Quartiles | float]) -> list[str]:
+def _cells(statistics: Mapping[str, Quartiles | float]) -> list[str]:
     cells = []
-    for value in figures.values():
+    for value in statistics.values():
         low, median, high = value if isinstance(value, tuple) else (value, value, value)
         text = "–" if np.isnan(median) else f"{median:.3f}"
         cells.append(f"{text} ({low:.3f} to {high:.3f})" if low < high else text)

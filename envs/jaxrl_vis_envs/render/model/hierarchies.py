@@ -72,7 +72,8 @@ def build_hierarchies(triangles: np.ndarray, places: np.ndarray) -> Hierarchies 
 
     Args:
         triangles: [R, COLUMNS] float32, see `meshes.build_triangles`.
-        places: [K, 2] int32, object and first row of each cluster, see there. Each object has its rows one after another.
+        places: [K, 2] int32, index of the object and first row of the triangles of each cluster: ``cluster_places`` of
+            `meshes.build_triangles`. Each object's triangles are in consecutive rows.
 
     Returns:
         The hierarchies of all objects with triangles, None if there are no triangles.

@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 MIN_JAW_ROOM = 0.005
 """Minimum room beside the open jaws, m, below which a stalk is crowded: the jaws cannot take it alone."""
-NEIGHBOUR_EDGES = (0.0, 0.03, 0.04, 0.05, 0.065, 0.1, math.inf)
+NEIGHBOUR_BIN_EDGES = (0.0, 0.03, 0.04, 0.05, 0.065, 0.1, math.inf)
 """Bin edges of distances to the nearest neighbour, m, centre to centre."""
 OUTCOMES = ("success", "miss", "wrong stalk", "several", "unreachable", "refused")
 STAGES = ("grasped", "not detected", "aimed beside", "out of reach", "refused", "not held", "several held")
@@ -136,7 +136,7 @@ class Score:
         collisions: Attempts whose links touched another stalk, among those sent.
         brushes: Attempts whose open gripper touched another stalk, among those sent.
         touches: Attempts with a collision or a brush, among those sent.
-        by_neighbour: Stalks grasped alone among the reachable ones in each bin of `NEIGHBOUR_EDGES`.
+        by_neighbour: Stalks grasped alone among the reachable ones in each bin of `NEIGHBOUR_BIN_EDGES`.
         thesis_ratio: The thesis's metric, mean over runs with attempts sent; NaN if there are none.
         runs: Number of runs with attempts sent.
         aim_errors: [A] float64, `Attempt.aim_error` of the attempts with a matched stalk, m.
@@ -276,7 +276,7 @@ def score(attempts: Iterable[Attempt], stalks: Iterable[TrueStalk], tolerance: f
                     if low <= stalk.neighbour and (stalk.neighbour < high or math.isinf(high))
                 ],
             )
-            for low, high in zip(NEIGHBOUR_EDGES, NEIGHBOUR_EDGES[1:])
+            for low, high in zip(NEIGHBOUR_BIN_EDGES, NEIGHBOUR_BIN_EDGES[1:])
         ),
         thesis_ratio=ratio,
         runs=runs,

@@ -20,7 +20,7 @@ from jaxrl_vis.run.trained.policy import Policy
 from jaxrl_vis.stalks.digests import value_digest
 from jaxrl_vis.stalks.grasping.evaluation.attempts import Loop, Plan, execute_plans, plan
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Score, TrueStalk, score
-from jaxrl_vis.stalks.grasping.evaluation.scoring import MaskScore, RunScore, draw_scene, score_scene, summarise_scores
+from jaxrl_vis.stalks.grasping.evaluation.scoring import MaskScore, RunScore, draw_scene, score_scene, summarize_scores
 from jaxrl_vis.stalks.grasping.masks.loading import load_painter
 from jaxrl_vis.stalks.grasping.perception.perceive import Variant
 from jaxrl_vis_envs.plants import Family
@@ -86,7 +86,7 @@ def evaluate_runs(
         "masks": conditions.masks,
         "method": str(conditions.variant),
     }
-    table = RecordFile(path, about, summarise)
+    table = RecordFile(path, about, summarize)
     missing = [number for number in numbers if number not in table]
     started(len(numbers) - len(missing))
 
@@ -123,14 +123,14 @@ def evaluate_run(conditions: Conditions, number: int) -> Record:
     }
 
 
-def summarise(records: Sequence[Record]) -> dict[str, Any]:
-    """Summarise the records of runs, as values for JSON.
+def summarize(records: Sequence[Record]) -> dict[str, Any]:
+    """Summarize the records of runs, as values for JSON.
 
     Returns:
-        The figures of `summarise_scores`, ``devices`` and ``workers`` of the records, and under ``reaches`` the scores of those
+        The figures of `summarize_scores`, ``devices`` and ``workers`` of the records, and under ``reaches`` the scores of those
         `Reaches` that all records hold, by name.
     """
-    figures: dict[str, Any] = summarise_scores([read_score(record) for record in records])
+    figures: dict[str, Any] = summarize_scores([read_score(record) for record in records])
     figures["devices"] = sorted({record["device"] for record in records})
     figures["workers"] = sorted({record["workers"] for record in records})
     known = [set(record.get("reaches", {})) for record in records]

@@ -219,8 +219,8 @@ def _mean_outline_distance(painted: np.ndarray, true: np.ndarray) -> float:
     return 0.5 * float(far[0][outlines[1] > 0].mean() + far[1][outlines[0] > 0].mean())
 
 
-def summarise_scores(scores: Iterable[RunScore]) -> dict[str, Any]:
-    """Summarise the scores of runs.
+def summarize_scores(scores: Iterable[RunScore]) -> dict[str, Any]:
+    """Summarize the scores of runs.
 
     Returns:
         ``f1``, ``precision`` and ``recall`` of stalks, ``point_median_mm`` and ``point_p95_mm``, ``stitch_median_mm`` and

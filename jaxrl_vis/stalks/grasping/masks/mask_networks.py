@@ -31,12 +31,12 @@ class Generator(nn.Module):
         levels = []
         for depth, channels in enumerate(self.channels):
             x = nn.Conv(channels, (4, 4), (2, 2), dtype=self.dtype, use_bias=depth == 0)(x)
-            x = _normalise(x, self.dtype) if depth else x
+            x = _normalize(x, self.dtype) if depth else x
             x = nn.leaky_relu(x, 0.2)
             levels.append(x)
         for channels, skip in zip(reversed(self.channels[:-1]), reversed(levels[:-1])):
             x = nn.ConvTranspose(channels, (4, 4), (2, 2), dtype=self.dtype, use_bias=False)(x)
-            x = nn.relu(_normalise(x, self.dtype))
+            x = nn.relu(_normalize(x, self.dtype))
             x = jnp.concatenate([x, skip], axis=-1)
         x = nn.ConvTranspose(self.outputs, (4, 4), (2, 2), dtype=self.dtype)(x).astype(jnp.float32)
         return jnp.tanh(x) if self.outputs == 3 else x
@@ -60,10 +60,10 @@ class Discriminator(nn.Module):
         for depth, channels in enumerate(self.channels):
             strides = (2, 2) if depth < len(self.channels) - 1 else (1, 1)
             x = nn.Conv(channels, (4, 4), strides, dtype=self.dtype, use_bias=depth == 0)(x)
-            x = _normalise(x, self.dtype) if depth else x
+            x = _normalize(x, self.dtype) if depth else x
             x = nn.leaky_relu(x, 0.2)
         return nn.Conv(1, (4, 4), dtype=jnp.float32)(x)[..., 0]
 
 
-def _normalise(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
+def _normalize(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
     return nn.GroupNorm(num_groups=None, group_size=8, dtype=dtype)(x)

@@ -20,7 +20,7 @@ import optax
 
 from jaxrl_vis.stalks.grasping.masks.examples import Example
 from jaxrl_vis.stalks.grasping.masks.mask_networks import Discriminator
-from jaxrl_vis.stalks.grasping.masks.painter import Settings, compute_dtype, normalise
+from jaxrl_vis.stalks.grasping.masks.painter import Settings, compute_dtype, normalize
 from jaxrl_vis.stalks.grasping.masks.variation import augment
 from jaxrl_vis.stalks.phenotyping.detector.losses import mask_loss
 from jaxrl_vis.stalks.phenotyping.training.pool import Pool
@@ -100,7 +100,7 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
     generator, average, discriminator, moments = state
     rate, decay = rates
     images, masks = augment(batch[0], batch[1], key)
-    network, judge, values = settings.generator(dtype), Discriminator(dtype=dtype), normalise(images)
+    network, judge, values = settings.generator(dtype), Discriminator(dtype=dtype), normalize(images)
     true = jnp.where(masks[..., None], jnp.array(_RED), values)
 
     def generator_loss(params: Any):
@@ -116,7 +116,7 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
         return adversarial + _NEAR_TRUTH * difference, ({"adversarial": adversarial, "difference": difference}, painted)
 
     gradients, (parts, painted) = jax.grad(generator_loss, has_aux=True)(generator)
-    updates, first = _optimiser().update(gradients, moments[0], generator)
+    updates, first = _optimizer().update(gradients, moments[0], generator)
     generator = jax.tree.map(lambda old, change: old + rate * change, generator, updates)
     average = jax.tree.map(lambda old, new: decay * old + (1.0 - decay) * new, average, generator)
     if settings.loss == "segmentation":
@@ -131,13 +131,13 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
         return 0.5 * (losses[0] + losses[1])
 
     loss, gradients = jax.value_and_grad(discriminator_loss)(discriminator)
-    updates, second = _optimiser().update(gradients, moments[1], discriminator)
+    updates, second = _optimizer().update(gradients, moments[1], discriminator)
     # As in pix2pix, the discriminator learns at half the speed.
     discriminator = jax.tree.map(lambda old, change: old + 0.5 * rate * change, discriminator, updates)
     return (generator, average, discriminator, (first, second)), {**parts, "discriminator": loss}
 
 
-def _optimiser() -> optax.GradientTransformation:
+def _optimizer() -> optax.GradientTransformation:
     # The learning rate is applied outside, because it depends on the elapsed time.
     return optax.chain(optax.clip_by_global_norm(5.0), optax.adam(1.0, b1=0.5))
 
@@ -149,9 +149,9 @@ def _init_state(settings: Settings, crop: int, key: jax.Array) -> Any:
     generator = settings.generator(jnp.float32).init(painter, blank)
     average = jax.tree.map(jnp.array, generator)
     if settings.loss == "segmentation":
-        return generator, average, None, (_optimiser().init(generator), None)
+        return generator, average, None, (_optimizer().init(generator), None)
     discriminator = Discriminator().init(judge, blank, blank)
-    return generator, average, discriminator, (_optimiser().init(generator), _optimiser().init(discriminator))
+    return generator, average, discriminator, (_optimizer().init(generator), _optimizer().init(discriminator))
 
 
 def train(

@@ -49,7 +49,7 @@ _HINTS = fields.hints(Settings)
 _MAX_LEVELS = 10  # each level halves height and width
 
 
-def normalise(images: jax.Array) -> jax.Array:
+def normalize(images: jax.Array) -> jax.Array:
     """Convert images of any shape from uint8 to float32 in -1 to 1."""
     return images.astype(jnp.float32) / 127.5 - 1.0
 
@@ -77,7 +77,7 @@ class Painter:
         network = settings.generator(compute_dtype())
 
         def paint(params: Any, image: jax.Array) -> jax.Array:
-            painted = network.apply(params, normalise(image)[None])
+            painted = network.apply(params, normalize(image)[None])
             assert isinstance(painted, jax.Array)
             if settings.loss == "segmentation":
                 return painted[0, ..., 0] > 0.0

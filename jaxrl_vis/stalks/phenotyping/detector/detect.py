@@ -136,7 +136,7 @@ def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
     return lines, columns
 
 
-def normalise(images: jax.Array) -> jax.Array:
+def normalize(images: jax.Array) -> jax.Array:
     """Map images [..., 3] uint8 to float32 in [-1, 1]; a square root expands dark tones, as flash light falls off quickly."""
     return 2.0 * jnp.sqrt(images.astype(jnp.float32) / 255.0) - 1.0
 
@@ -293,7 +293,7 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
     """
     network = settings.detector(dtype)
     shape = (image.shape[0], image.shape[1])
-    features = network.apply(params, normalise(image)[None], method="features")
+    features = network.apply(params, normalize(image)[None], method="features")
     assert isinstance(features, jax.Array)
     logits, offsets = apply_heads(network, params, features, "propose")
     if settings.section:

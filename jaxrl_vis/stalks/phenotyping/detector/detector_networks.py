@@ -79,7 +79,7 @@ class Detector(nn.Module):
         self.refine = nn.Dense(6, kernel_init=nn.initializers.normal(0.01), dtype=jnp.float32)
 
     def features(self, images: jax.Array) -> jax.Array:
-        """Compute features [N, H / 8, W / 4, C] of images [N, H, W, 3], see `detect.normalise`."""
+        """Compute features [N, H / 8, W / 4, C] of images [N, H, W, 3], see `detect.normalize`."""
         x = nn.relu(self.stem(images.astype(self.dtype)))
         for block in (*self.fine, *self.middle):
             x = block(x)

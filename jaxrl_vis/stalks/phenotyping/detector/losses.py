@@ -8,7 +8,7 @@ import optax
 
 from jaxrl_vis.stalks.phenotyping.detector.anchors import encode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import box_iou, strip_overlap
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, apply_heads, normalise, pool_regions, select_proposals
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, apply_heads, normalize, pool_regions, select_proposals
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import preprocess_crops
@@ -65,7 +65,7 @@ def detector_loss(
     network = settings.detector(dtype)
     shape = (images.shape[1], images.shape[2])
     anchors = jnp.asarray(make_anchors(shape, settings.band_height, settings.anchor_widths))
-    features = network.apply(params, normalise(images), method="features")
+    features = network.apply(params, normalize(images), method="features")
     assert isinstance(features, jax.Array)
     logits, offsets = apply_heads(network, params, features, "propose")
 

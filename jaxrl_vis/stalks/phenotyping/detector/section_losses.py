@@ -8,7 +8,7 @@ import optax
 
 from jaxrl_vis.stalks.phenotyping.detector.anchors import encode
 from jaxrl_vis.stalks.phenotyping.detector.boxes import box_iou, strip_overlap
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, apply_heads, normalise, pool_regions, section_proposals
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, apply_heads, normalize, pool_regions, section_proposals
 from jaxrl_vis.stalks.phenotyping.detector.losses import assign_boxes, focal_loss, offset_loss
 from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, section_anchors, true_sections
 
@@ -43,7 +43,7 @@ def section_loss(
     """
     network = settings.detector(dtype)
     anchors = jnp.asarray(section_anchors((images.shape[1], images.shape[2]), settings.section, settings.anchor_widths))
-    features = network.apply(params, normalise(images), method="features")
+    features = network.apply(params, normalize(images), method="features")
     assert isinstance(features, jax.Array)
     logits, offsets = apply_heads(network, params, features, "propose")
 

@@ -21,7 +21,7 @@ import jaxrl_vis_envs.plants
 from jaxrl_vis.host.provenance import device_name, revision
 from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all
 from jaxrl_vis.stalks.digests import file_digest, value_digest
-from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, ThesisScore, score_plot, summarise_scores
+from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, ThesisScore, score_plot, summarize_scores
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis_envs.plants import Family
 
@@ -112,7 +112,7 @@ def evaluate_tasks(
         done: Called after each plot with the task's name, the seed and the record.
 
     Returns:
-        Name -> summary of all plots, see `scoring.summarise_scores`.
+        Name -> summary of all plots, see `scoring.summarize_scores`.
 
     Raises:
         RequestError: A file holds records of another evaluation, or cannot be read.
@@ -120,8 +120,8 @@ def evaluate_tasks(
     """
     names = list(tasks)
     first = tasks[names[0]]
-    summarise_plots = functools.partial(summarise, first.min_score)
-    tables = {name: RecordFile(paths[name], conditions(task), summarise_plots) for name, task in tasks.items()}
+    summarize_plots = functools.partial(summarize, first.min_score)
+    tables = {name: RecordFile(paths[name], conditions(task), summarize_plots) for name, task in tasks.items()}
     started(sum(seed in table for table in tables.values() for seed in seeds))
     jobs = [(name, seed) for name in names for seed in seeds if seed not in tables[name]]
 
@@ -131,7 +131,7 @@ def evaluate_tasks(
         done(name, seed, tables[name].records[seed])
 
     evaluate_all(functools.partial(_evaluate_job, dict(tasks), jobs), range(len(jobs)), first.workers, keep)
-    return {name: summarise_plots([table.records[seed] for seed in seeds]) for name, table in tables.items()}
+    return {name: summarize_plots([table.records[seed] for seed in seeds]) for name, table in tables.items()}
 
 
 def _evaluate_job(tasks: Mapping[str, Task], jobs: Sequence[tuple[str, int]], number: int) -> Record:
@@ -144,9 +144,9 @@ def read_scores(records: Iterable[Record]) -> list[PlotScore]:
     return [_read_score(record) for record in records]
 
 
-def summarise(min_score: float, records: Iterable[Record]) -> dict[str, Any]:
-    """Summarise the records of plots, see `summarise_scores`."""
-    return summarise_scores(read_scores(records), min_score)
+def summarize(min_score: float, records: Iterable[Record]) -> dict[str, Any]:
+    """Summarize the records of plots, see `summarize_scores`."""
+    return summarize_scores(read_scores(records), min_score)
 
 
 def _make_record(score: PlotScore, pairs: int) -> Record:

@@ -227,8 +227,8 @@ def average_precision(detections: np.ndarray, stalks: int) -> float:
     return float(np.where(place < len(precision), precision[np.minimum(place, len(precision) - 1)], 0.0).mean())
 
 
-def summarise_scores(scores: Iterable[PlotScore], min_score: float = 0.5) -> dict[str, Any]:
-    """Summarise the scores of plots.
+def summarize_scores(scores: Iterable[PlotScore], min_score: float = 0.5) -> dict[str, Any]:
+    """Summarize the scores of plots.
 
     Args:
         scores: Scores of the plots.

@@ -20,7 +20,7 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import Size, UnrectifiedPair
-from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import (
+from jaxrl_vis.stalks.phenotyping.io.calibrations.recognize import (
     calibration_files,
     find_pair_file,
     find_side_files,

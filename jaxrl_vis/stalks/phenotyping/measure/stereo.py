@@ -73,7 +73,7 @@ class StalkDisparity:
         return mean, scatter / math.sqrt(count)
 
 
-def to_greyscale(image: np.ndarray) -> np.ndarray:
+def to_grey_floats(image: np.ndarray) -> np.ndarray:
     """Convert an image [H, W] or [H, W, 3] of any dtype to greyscale [H, W] float32."""
     return (
         image.astype(np.float32) if image.ndim == 2 else image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)

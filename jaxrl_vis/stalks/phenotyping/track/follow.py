@@ -28,7 +28,7 @@ class Gates:
         along: Maximum distance along the row between a track and a sighting assigned to it.
         depth: Maximum difference of their depths.
         merge: Maximum distance along the row between two tracks of one stalk, which are merged.
-        behind: The same for tracks of different depth, with the rays of one evaluated at the depth of the other.
+        merge_across_depths: The same for tracks of different depth, with the rays of one evaluated at the depth of the other.
         max_shared: Maximum fraction of the pairs of the shorter track in which both are seen, to merge them.
         max_row_offset: Maximum difference between the depth of a counted stalk and the median depth.
         min_fraction: Minimum fraction of the pairs with the stalk in view that must show it to count it.
@@ -39,7 +39,7 @@ class Gates:
     along: float = 0.018
     depth: float = 0.05
     merge: float = 0.015
-    behind: float = 0.005
+    merge_across_depths: float = 0.005
     max_shared: float = 0.34
     max_row_offset: float = 0.2
     min_fraction: float = 0.3
@@ -287,7 +287,7 @@ def _merge_tracks(tracks: list[_OpenTrack], gates: Gates) -> list[_OpenTrack]:
             shared = {frame for frame, _ in track.sightings} & {frame for frame, _ in other.sightings}
             # A wrongly assigned sighting may make both appear in one pair.
             near = aside < gates.merge and away < gates.depth
-            if (near or _one_behind(track, other) < gates.behind) and len(shared) <= gates.max_shared * len(track.sightings):
+            if (near or _one_behind(track, other) < gates.merge_across_depths) and len(shared) <= gates.max_shared * len(track.sightings):
                 other.sightings += track.sightings
                 other.along += track.along
                 other.depth += track.depth

@@ -8,7 +8,7 @@ from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, find_ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import DEPTHS, measure_stalk, stalk_disparity
 from jaxrl_vis.stalks.phenotyping.measure.width import fit_strip
-from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sighting, to_grey
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sighting, to_grey_bytes
 from jaxrl_vis_envs.plants import Calibration
 
 _MIN_STALKS = 4
@@ -37,7 +37,7 @@ def pair_fault(
         calibration: Calibration of the cameras.
         ground: Ground plane found in the pair; None if none.
     """
-    grey_left, grey_right = to_grey(left), to_grey(right)
+    grey_left, grey_right = to_grey_bytes(left), to_grey_bytes(right)
     measured = sum(sighting.diameter_mm is not None for sighting in sightings)
     fault = _orientation_fault(grey_left, grey_right, calibration) if ground is None else None
     if fault is None and (ground is None or measured < _MIN_MEASURED * len(detections)):

@@ -126,7 +126,7 @@ def _field_kind(hint: Any) -> tuple[type | tuple[type, ...], bool, int]:
 _KINDS = {name: _field_kind(hint) for name, hint in fields.hints(Sighting).items()}
 
 
-def to_grey(image: np.ndarray) -> np.ndarray:
+def to_grey_bytes(image: np.ndarray) -> np.ndarray:
     """Convert an RGB image [H, W, 3] uint8 to greyscale [H, W] uint8."""
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
@@ -154,7 +154,7 @@ def detect_with_ground(
     if calibration is None:
         return find(left, None, None), None
     with ThreadPoolExecutor(1) as aside:
-        ground = aside.submit(lambda: find_ground(to_grey(left), to_grey(right), calibration, disparity))
+        ground = aside.submit(lambda: find_ground(to_grey_bytes(left), to_grey_bytes(right), calibration, disparity))
 
         def band(column: float) -> tuple[float, float]:  # waits for the ground, but not before a detector asks
             return band_lines(ground.result(), calibration, distance, column)
@@ -251,7 +251,7 @@ def measure_pair(
     """
     if calibration is None:
         return [_unscaled_sighting(detection) for detection in detections]
-    grey_left, grey_right = to_grey(left), to_grey(right)
+    grey_left, grey_right = to_grey_bytes(left), to_grey_bytes(right)
     measured: list[tuple[Measurement, Measurement | None]] = []
     for detection in detections:
         line = 0.5 * (detection.box[1] + detection.box[3])

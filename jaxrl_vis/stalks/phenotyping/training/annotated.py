@@ -18,7 +18,7 @@ from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import cut_crops
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.calibration import check_size, find_calibration, read_calibration
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, to_rgb8
-from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, rasterise_polygons
+from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, rasterize_polygons
 from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE
 from jaxrl_vis.stalks.phenotyping.training.edges import annotated_edges
 from jaxrl_vis.stalks.phenotyping.training.examples import MAX_STALKS, Example, make_example
@@ -201,7 +201,7 @@ def _annotated_mask(annotation: dict[str, Any], size: tuple[int, int]) -> np.nda
         return decode_mask(segmentation)
     left, top, wide, tall = annotation["bbox"]
     right, bottom = left + wide, top + tall
-    return rasterise_polygons(segmentation or [[left, top, right, top, right, bottom, left, bottom]], size)
+    return rasterize_polygons(segmentation or [[left, top, right, top, right, bottom, left, bottom]], size)
 
 
 def _annotated_stalk(annotation: dict[str, Any], size: tuple[int, int]) -> list[float]:

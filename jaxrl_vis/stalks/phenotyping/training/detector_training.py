@@ -165,7 +165,7 @@ def update_networks(
         return total + of_masks, {**parts, "masks": of_masks}
 
     gradients, parts = jax.grad(loss, has_aux=True)(params)
-    updates, moments = _optimiser().update(gradients, moments, params)
+    updates, moments = _optimizer().update(gradients, moments, params)
     updates = _map_frozen(jnp.zeros_like, updates, frozen)  # weight decay also acts at zero gradient
     params = jax.tree.map(lambda old, change: old + rate * change, params, updates)
     average = jax.tree.map(lambda old, new: decay * old + (1.0 - decay) * new, average, params)
@@ -190,7 +190,7 @@ def init_state(params: Any) -> State:
 @jax.jit
 def _init_averages(params: Any) -> tuple[Any, Any]:
     """Return the initial parameter average and optimiser state."""
-    return jax.tree.map(jnp.copy, params), _optimiser().init(params)  # a donated buffer must not appear twice
+    return jax.tree.map(jnp.copy, params), _optimizer().init(params)  # a donated buffer must not appear twice
 
 
 def init_networks(settings: Settings, detector_key: jax.Array, segmenter_key: jax.Array) -> dict[str, Any]:
@@ -217,7 +217,7 @@ def start_sections(params: Any, settings: Settings, seed: int) -> tuple[Any, Set
     return {**params, "detector": {**params["detector"], "params": detector}}, settings
 
 
-def _optimiser() -> optax.GradientTransformation:
+def _optimizer() -> optax.GradientTransformation:
     # The learning rate is applied outside, as its schedule depends on elapsed time.
     return optax.chain(optax.clip_by_global_norm(5.0), optax.adamw(1.0, weight_decay=1e-4))
 

@@ -84,13 +84,13 @@ def _match_names(names: Sequence[str], plots: Sequence[str]) -> dict[str, list[i
         names: Identifier in each row.
         plots: Names of the plots.
     """
-    for normalise in (str, _last_component, _digits):
+    for normalize in (str, _last_component, _digits):
         rows: dict[str, list[int]] = {}
         for number, name in enumerate(names):
-            if name and normalise(name):
-                rows.setdefault(normalise(name), []).append(number)
-        matched = {plot: rows[normalise(plot)] for plot in plots if normalise(plot) in rows}
-        if matched and len({normalise(plot) for plot in matched}) == len(matched):
+            if name and normalize(name):
+                rows.setdefault(normalize(name), []).append(number)
+        matched = {plot: rows[normalize(plot)] for plot in plots if normalize(plot) in rows}
+        if matched and len({normalize(plot) for plot in matched}) == len(matched):
             return matched
     return {}
 
@@ -135,7 +135,7 @@ def _no_plot_message(path: Path, columns: Sequence[str], names: Sequence[str], p
     return f"{path} names no plot of these: its {columns[0]} has {theirs}, and the folders are {own}"
 
 
-def missing_plots(plan: Mapping[str, object], plots: Sequence[str]) -> str | None:
+def missing_plots_message(plan: Mapping[str, object], plots: Sequence[str]) -> str | None:
     """Return a line that lists the plots missing from a plan; None if there are none."""
     missing = [readable(plot) for plot in plots if plot not in plan]
     if not missing:
