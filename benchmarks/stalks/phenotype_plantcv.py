@@ -156,7 +156,7 @@ if __name__ == "__main__":
     parser.add_argument("--workers", type=int, default=1, help="processes that draw plots side by side")
     parser.add_argument("--frames", type=int, default=34, help="pairs of a plot")
     parser.add_argument("--width", type=int, default=3376, help="of an image, pixels")
-    parser.add_argument("--truth", action="store_true", help="true masks in place of the networks'")
+    parser.add_argument("--truth", action="store_true", help="true masks instead of the networks'")
     arguments = parser.parse_args()
     if arguments.plots:
         keep_masks(arguments)

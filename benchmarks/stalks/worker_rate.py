@@ -32,7 +32,7 @@ def parse_options() -> argparse.Namespace:
         "--workers", type=int, nargs="*", default=[], help="processes side by side; several numbers, one by one"
     )
     parser.add_argument("--seconds", type=float, default=10.0, help="how long each number of them is timed")
-    parser.add_argument("--width", type=int, help="of an image, pixels, in place of the family's")
+    parser.add_argument("--width", type=int, help="of an image, pixels, instead of the family's")
     parsed = parser.parse_args()
     if parsed.workers:
         share_accelerator()

@@ -115,7 +115,7 @@ def renderer() -> str:
     if (int(frame.segmentation[corner]), int(frame.segmentation[middle])) != (0, 1):
         raise ValueError("the image shows other objects than there are")
     if abs(ball - 1.5) > 1e-3 or abs(floor - 2.0) > 1e-3:
-        raise ValueError(f"depths are {ball:.4f} and {floor:.4f} m in place of 1.5 and 2 m")
+        raise ValueError(f"depths are {ball:.4f} and {floor:.4f} m instead of 1.5 and 2 m")
     return f"depths and objects of a {size}x{size} image are right"
 
 

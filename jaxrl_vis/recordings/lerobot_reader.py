@@ -65,7 +65,7 @@ class _Reader:
         self._rows, self._steps = rows, lengths.pop()
         self._data = self._table("data").sort_by("index")
         if len(self._data) != len(rows) * self._steps:
-            raise RequestError(f"there are {len(self._data)} steps in place of {len(rows)} times {self._steps}")
+            raise RequestError(f"there are {len(self._data)} steps instead of {len(rows)} times {self._steps}")
         is_ours = any(name.startswith(form.LAST) for name in rows[0])
         actions = self._numbers(form.ACTION)
         observations, goals = self._observations(is_ours)

@@ -278,7 +278,7 @@ def test_nothing_seen_is_no_count(plots, tmp_path, capsys):
     assert row["flag"] == "nothing like a row seen" and row["stalks"] == row["stalks_per_m"] == row["width_mean_mm"] == ""
     assert "nothing like a row seen" in (tmp_path / "out" / "qc.html").read_text()
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("plot_0000: ")]
-    assert line.startswith("plot_0000: nothing like a row seen (0 finds in 4 pairs") and line.endswith(", so no count")
+    assert line.startswith("plot_0000: nothing like a row seen (0 detections in 4 pairs") and line.endswith(", so no count")
 
 
 def test_a_lens_that_was_not_tried_gives_no_numbers(plots, tmp_path):

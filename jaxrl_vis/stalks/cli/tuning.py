@@ -142,7 +142,7 @@ def _report(
         echo(
             f"{name:6} on {result.images} held-out images: {result.true_positives} of {result.labels} "
             f"{'sections' if settings.section else 'stalks'} found, "
-            f"{result.detections - result.true_positives} false finds, F1 {result.f1:.2f}, AP50 {result.ap50:.2f}"
+            f"{result.detections - result.true_positives} false detections, F1 {result.f1:.2f}, AP50 {result.ap50:.2f}"
             + (f", masks overlap {overlap:.2f}" if math.isfinite(overlap) else "")
         )
     facts = [

@@ -127,7 +127,7 @@ def run(
         any(request.out.glob("pairs/*/*.json")),
     )
     about = [
-        f"jaxrl-vis {jaxrl_vis.__version__}; finds by {request.finder}; widths by the method {request.method}.",
+        f"jaxrl-vis {jaxrl_vis.__version__}; detections by {request.finder}; widths by the method {request.method}.",
         "Tables: stalks.csv, plots.csv and skipped.csv; all pairs: overlays/.",
     ]
     if request.lens_range is not None:
@@ -194,9 +194,9 @@ def _missing_count_reason(flag: str, frames: list[list[Sighting]], plot: PlotFol
         return "its distances, or the baseline of the calibration, may be in another unit"
     if flag != NO_ROW:
         return ""
-    finds = sum(map(len, frames))
+    detections = sum(map(len, frames))
     return (
-        f"{finds} finds in {len(frames)} pairs, none of which counts: unless the plot is empty, its images are not "
+        f"{detections} detections in {len(frames)} pairs, none of which counts: unless the plot is empty, its images are not "
         "such as the networks know, see its overlays"
     )
 

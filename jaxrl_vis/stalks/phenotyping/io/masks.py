@@ -60,7 +60,7 @@ def check_runs(counts: Sequence[float], height: int, width: int) -> np.ndarray:
 
 
 def rasterize_polygons(outlines: list[list[float]], size: tuple[int, int]) -> np.ndarray:
-    """Rasterise polygons to a mask [H, W] bool: the pixels whose centre lies inside any of them (by the even-odd rule).
+    """Rasterize polygons to a mask [H, W] bool: the pixels whose centre lies inside any of them (by the even-odd rule).
 
     The mean number of mask pixels per row thus equals the width of a strip; filling the boundary, too, as OpenCV does, would
     make it one pixel wider.

@@ -54,7 +54,7 @@ TRAITS = (
     Trait("width_se_mm", "stalk diameter", "mm", "standard error of the mean, 12 inches above the ground", _DIAMETER),
     Trait("width_24in_mean_mm", "stalk diameter", "mm", "mean over stalks, 24 inches above the ground", _DIAMETER),
     Trait("taper_mean_mm_per_in", "stalk taper", "mm/[in_i]", "mean over stalks, from 12 to 24 inches above the ground"),
-    Trait("length_m", "row length", "m", "way of the robot along the row"),
+    Trait("length_m", "row length", "m", "distance travelled by the robot along the row"),
     Trait("stalks_measured", "stalk number", "1", "count of the stalks whose diameter was measured", is_integer=True),
 )
 _ABOUT = ("flag", "method", "version")

@@ -163,8 +163,8 @@ class Page:
         if finds:
             total = sum(map(len, plot.frames))
             write(
-                f"<h3>Finds without a width, of {total} in single pairs</h3>"
-                + html_table({"why": "why", "finds": "finds"}, finds)
+                f"<h3>Detections without a width, of {total} in single pairs</h3>"
+                + html_table({"why": "why", "finds": "detections"}, finds)
             )
         write("<h3>Pairs</h3>" + "".join(pictures.pair_images(self._whole)) + "</details>\n")
 

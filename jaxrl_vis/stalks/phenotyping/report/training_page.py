@@ -22,7 +22,7 @@ _COLUMNS = {
     "images": "images",
     "labels": "annotated",
     "true_positives": "found",
-    "false": "false finds",
+    "false": "false detections",
     "precision": "precision",
     "recall": "recall",
     "f1": "F1",
