@@ -293,7 +293,7 @@ def test_every_benchmark_keeps_records(benchmark: str, tmp_path: Path, monkeypat
 
 
 def test_what_one_of_several_devices_does() -> None:
-    """The measure of efficiency: a run of one device with its share of the seeds, or of the learner."""
+    """Efficiency is relative to a run of one device with its share of the seeds, or of the learner."""
     config = preset("debug", seeds=6, num_envs=8, batch_size=16, replay_transitions=800)
     seeds = train.single_device_config(config.replace(devices=2))
     assert (seeds.run.devices, seeds.run.seeds, seeds.run.num_envs, seeds.run.batch_size) == (1, 3, 8, 16)

@@ -12,7 +12,7 @@ from jaxrl_vis.errors import RequestError
 
 
 class Point:
-    """In the place of Gymnasium-Robotics' environment: a grip that moves by 5 cm a step at most."""
+    """Stand-in for Gymnasium-Robotics' environment: a grip that moves by at most 5 cm per step."""
 
     def reset(self, seed):
         self.grip, self.goal = np.zeros(3), np.random.default_rng(seed).uniform(-0.15, 0.15, 3)
@@ -28,7 +28,7 @@ class Point:
 
 
 class Picture:
-    """In the place of the camera: brightness is the first coordinate."""
+    """Stand-in for the camera: the brightness of its image is the grip's first coordinate."""
 
     def __init__(self, env):
         self.env = env

@@ -43,7 +43,7 @@ HELP = [[], ["phenotype"], *(name.split() for name in cli.all_commands())]
 
 @pytest.fixture(scope="module")
 def helped() -> list[tuple[list[str], str]]:
-    """For each command of `HELP`, what of the heavy packages is imported after it, and what it prints: one process for all."""
+    """Return, for each command of `HELP`, the heavy packages imported after it, and its output; all run in one process."""
     code = f"""
 import contextlib, io, json, sys
 from jaxrl_vis import cli

@@ -176,7 +176,7 @@ def test_a_run_whose_programs_compile_asks_nothing(gpu):
 
 @pytest.mark.parametrize("module", [kernel, encoder_kernel_passes, steps_kernel])
 def test_the_kernels_themselves_are_probed_in_the_midst_of_a_trace(module, gpu):
-    """As far as they can be compiled without a GPU: down to Triton's code."""
+    """Without a GPU, the kernels are compiled down to Triton's code only."""
     gpu()
 
     def probe() -> None:
@@ -225,7 +225,7 @@ def test_a_program_holds_the_branch_of_its_own_platform(gpu):
 
 
 def test_mlir_finds_the_dialect_of_triton(monkeypatch):
-    """Which jaxlib keeps elsewhere than MLIR expects it; where that has ended, so can the name that it is given here."""
+    """MLIR expects the dialect in another module than jaxlib's; once that has changed, the name given to it here can go."""
     name = "jaxlib.mlir.dialects.tt"
     monkeypatch.delitem(sys.modules, name, raising=False)
     with pytest.raises(ImportError):
@@ -301,7 +301,7 @@ def test_an_image_is_drawn_by_the_kernel_of_its_own_platform(gpu, monkeypatch):
 
 
 def test_the_probe_of_the_kernel_is_an_instance_of_it(monkeypatch):
-    """That it compiles needs a GPU; that it can be lowered does not."""
+    """The probe can be lowered without a GPU; compiling it would need one."""
     from jaxrl_vis_envs.render.gpu import kernel
 
     assert KERNEL_CALL in lowered_for_nvidia(kernel.probe_program)
@@ -309,7 +309,7 @@ def test_the_probe_of_the_kernel_is_an_instance_of_it(monkeypatch):
 
 @pytest.mark.parametrize("chosen", [(700, 10, 10), (0, 10, 10), (500_000, 5, 5)])
 def test_garbage_is_looked_for_as_before_once_programs_are_traced(chosen):
-    """Whatever the process chose, also never; and never more often while they are."""
+    """The threshold chosen by the process, 0 included, is restored; during tracing, collections are never more frequent."""
     before = gc.get_threshold()
     try:
         gc.set_threshold(*chosen)

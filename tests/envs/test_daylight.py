@@ -52,7 +52,7 @@ def bare() -> tuple[Sequence, tuple]:
     ids=["training", "shifted"],
 )
 def test_families_without_days_are_as_they_were(family, sums):
-    """Sums of the surfaces as they were before there were plots by day; images follow from them by a program of their own."""
+    """Sums of the surfaces are as before there were plots by day; images follow from them by a program of their own."""
     plot = plants.draw(family, 3)
     assert plot.family is family and settle(family, generator(family, 3, "scene")) is family
     assert daylight(family, 3) is None

@@ -219,7 +219,7 @@ def test_sanitize_action():
 
 
 def test_images_stack_newest_first():
-    """Compared with an environment that observes one image, from the same key, under the same actions."""
+    """Stacked images consist of those of an environment with single images, from the same key and under the same actions."""
     (env, *states), (_, *states_1) = seen_episodes(3), seen_episodes()
     (start, steps), (start_1, steps_1) = ([state.obs for state in each] for each in (states, states_1))
     assert start is not None and steps is not None and start_1 is not None and steps_1 is not None

@@ -18,7 +18,7 @@ COUNT = 2000
 
 @functools.cache
 def places(met_goals: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Where the box starts and where it should be in COUNT episodes: [N, 3] m."""
+    """Return the positions of the box at the start and at the goal of COUNT episodes, [N, 3] each, m."""
     env = environments.make("FetchPush", met_goals=met_goals)
 
     def both(key):

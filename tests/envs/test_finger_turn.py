@@ -71,7 +71,7 @@ def test_control_period(substeps, period):
 
 
 def test_a_step_matches_mujoco():
-    """With the task's own iterations."""
+    """The task's own number of solver iterations suffices."""
     env = make()
     states = one_step.finger_states(env)
     theirs = one_step.mujoco_step(env.mj_model, states, weld_term=True)

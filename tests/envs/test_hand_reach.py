@@ -84,7 +84,7 @@ def test_gym_rule():
 
 
 def test_a_step_matches_mujoco():
-    """With the task's own single iteration."""
+    """The task's own single solver iteration suffices."""
     env = make()
     states = one_step.hand_states(env)
     theirs = one_step.mujoco_step(env.mj_model, states, weld_term=True)

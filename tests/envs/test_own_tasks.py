@@ -207,7 +207,7 @@ def test_options_reach_a_custom_task(my_task: str) -> None:
 def test_a_run_is_found_again_from_another_folder(
     my_task: str, here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Trained by name in one folder, evaluated and played in another, and refused in one line once the file is gone."""
+    """A run trained in one folder is evaluated and played from another; without the task's file, one line says so."""
     tiny = ["--preset", "debug", "--image-size", "8", "--encoder-filters", "4", "--env-steps", "40", "--eval-episodes", "2"]
     assert cli.main(["train", "--env", my_task, *tiny]) == 0
     run = (here / "runs" / "my_task-MyReach-oracle-debug-seed0").resolve()

@@ -188,7 +188,7 @@ def test_several_frames_show_the_last_images(layout: Any) -> None:
 
 
 def test_materials_and_textures_of_randomized_models_are_drawn() -> None:
-    """As Playground's randomisation of images does it: other colours and textures of a material in each environment."""
+    """Environments have different colours and textures of a material, as with Playground's randomisation of images."""
     env = PlaygroundEnv()
     env._mj_model = mujoco.MjModel.from_xml_string(TEXTURED_XML)
     env._mjx_model = model = mjx.put_model(env._mj_model)
@@ -216,7 +216,7 @@ def test_materials_and_textures_of_randomized_models_are_drawn() -> None:
 
 
 def test_randomized_models_are_drawn(playground: pixels.PixelEnv) -> None:
-    """As Playground's wrapper for domain randomisation does it: the model of what is unwrapped is replaced while tracing."""
+    """The unwrapped environment's model is replaced while tracing, as by Playground's wrapper for domain randomisation."""
     model = playground.mjx_model
     heights = jnp.array([0.0, 0.5])
     colours = jnp.stack([model.geom_rgba, model.geom_rgba.at[1].set(jnp.array([0.0, 1.0, 0.0, 1.0]))])
@@ -545,7 +545,7 @@ def test_images_of_wrapped_environments_equal_those_of_mujoco(name: str) -> None
 
 @pytest.mark.parametrize("name", make_pixels_references.MODELS)
 def test_normals_are_those_of_the_depths_of_mujoco(name: str) -> None:
-    """Normals of the surface through the points of MuJoCo's depth image, where one object fills a pixel's neighbourhood."""
+    """The surface goes through the points of MuJoCo's depth image; compared is where one object fills the neighbourhood."""
     model = make_pixels_references.MODELS[name]
     mj_model, references = model.load(), render_references.load(name)
     views = pixels.Views(mj_model, model.camera, references.rgb.shape[1:3], ("normals", "segmentation"))

@@ -215,7 +215,7 @@ def test_mjx_steps_a_varied_model_as_mujoco_does() -> None:
 
 
 def test_the_gpu_kernel_draws_varied_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In Pallas's interpreter: the scene's leaves differ between environments of a batch, and both paths render the same."""
+    """The kernel, interpreted, renders the same as the plain path if the scene's leaves differ between environments."""
     scene, _ = draw_shape()
     start = episodes(ALL)[0]
     assert kernel.supports(scene)
@@ -269,7 +269,7 @@ def test_every_image_task_takes_every_kind() -> None:
 
 
 def test_training_command_randomizes() -> None:
-    """`jaxrl-vis train --randomize camera dynamics --randomize-strength 2`."""
+    """The settings of `jaxrl-vis train --randomize camera dynamics --randomize-strength 2` reach the environment."""
     settings = {"randomize": ("camera", "dynamics"), "randomize_strength": 2.0}
     env = make_env(preset("debug", env="VisualReacher", **settings))
     assert env.config.randomization == typical("camera", "dynamics", strength=2.0)

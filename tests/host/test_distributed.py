@@ -149,7 +149,7 @@ def test_processes_train_a_task_with_physics(tmp_path: Path) -> None:
 
 
 def test_each_process_says_why_it_refuses(tmp_path: Path) -> None:
-    """None is ended by JAX because another one was faster."""
+    """No process is ended by JAX because another one was faster."""
     ends = two_trainings("Reacher", "--seeds", "3", "--run-dir", str(tmp_path / "run"))
     assert [status for status, _, _ in ends] == [2, 2], ends
     assert all("seeds 3 cannot be divided among 2 devices" in words.splitlines()[-1] for _, _, words in ends), ends

@@ -175,7 +175,7 @@ def test_a_command_whose_result_is_printed_says_that_nobody_got_it(kind, monkeyp
 
 
 def test_files_do_not_take_the_place_of_closed_streams(tmp_path, clean_environment):
-    """Or else what libraries in C print would be written into a run's files."""
+    """Otherwise, output of C libraries would be written into a run's files."""
     code = f"""
 import os
 for number in range(3):

@@ -22,7 +22,7 @@ def draw(key):
 
 
 def test_steps_are_those_of_optax():
-    """Also after an interval in which only one of the networks took any."""
+    """Steps are equal even after an interval in which only one of the networks took any."""
     ours, theirs = draw(jax.random.key(0)), draw(jax.random.key(0))
     states = [adam.init(params) for params in ours]
     optimizers = [optax.adam(rate) for rate in RATES]

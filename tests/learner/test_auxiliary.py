@@ -127,7 +127,7 @@ def test_every_auxiliary_loss_is_learned_and_reaches_both_encoders():
 
 
 def test_a_weighted_gradient_is_the_sum_of_the_losses_own():
-    """Of fixed weights: the gradient with two tasks is that with each of them alone, less what both have in common."""
+    """With fixed weights, the gradient with two tasks is the sum of those with one task each, less their common part."""
     found = {}
     for tasks in ((), ("inverse_dynamics",), ("egomotion",), ("inverse_dynamics", "egomotion")):
         weighting = {"weighting": "fixed", "weighting_fixed": 3.0} if tasks else {"weighting": "none_log"}
@@ -149,7 +149,7 @@ def test_both_ways_to_gradients_agree():
 
 
 def test_targets_move_with_the_images_whoever_makes_them(monkeypatch):
-    """Images in blocks, moved one by one, and in the patches of a GPU's kernels, here without one."""
+    """Results are equal for images shifted one by one and for the patches of the GPU's kernels, here without a GPU."""
     settings = {
         "aux_tasks": ("autoencoder", "optical_flow", "egomotion"),
         "weighting": "ol_aux",
@@ -269,7 +269,7 @@ TWO = ("inverse_dynamics", "forward_dynamics")
 
 @pytest.mark.parametrize("weighting", ["mgda", "famo", "gradnorm", "pcgrad", "moco"])
 def test_a_weighting_of_any_kind_trains_both_networks(weighting):
-    """By a Gramian, losses, learned lengths, drawn orders, and tracked gradients."""
+    """Weightings use a Gramian, losses, learned gradient lengths, random orders, or tracked gradients."""
     _, update, working, batch = learner(aux_tasks=TWO, weighting=weighting)
     for _ in range(2):
         before, (working, gradients, metrics) = working, update(working, batch)
@@ -289,14 +289,14 @@ def test_both_ways_to_a_gramian_train_alike():
 
 
 def test_a_main_loss_that_is_like_the_others_is_weighted_in_both_networks():
-    """A third of the plain sum, everywhere; and where weights are for encoders alone, heads learn as they do from the sum."""
+    """`uniform` has a third of the sum's gradients; where weights are for encoders alone, heads learn as from the sum."""
     found = {}
     for weighting in ("sum", "uniform", "mgda"):
         _, update, working, batch = learner(aux_tasks=TWO, weighting=weighting)
         found[weighting] = update(working, batch)[1]
 
     def assert_same(one, other):
-        """Up to the rounding of each array's largest numbers."""
+        """Compare up to the rounding of each array's largest numbers."""
         np.testing.assert_allclose(other, one, rtol=0, atol=1e-5 * np.abs(one).max())
 
     of_sum, uniform = ((found[name].critic, found[name].actor) for name in ("sum", "uniform"))

@@ -139,7 +139,7 @@ def test_forms_between_change_the_loss_or_the_networks_alone():
 
 
 def test_goals_follow_geometrically():
-    """From a replay whose observations name their episode and time."""
+    """Goals are sampled from a replay whose observations encode their episode and time."""
     horizon, episodes, discount = 6, 3, 0.7
     names = np.arange(episodes)[:, None] * 100.0 + np.arange(horizon + 2)
     observations = np.broadcast_to(names[..., None], (episodes, horizon + 2, 2)).astype(np.float32)
@@ -232,7 +232,7 @@ def test_it_learns_from_images():
 
 
 def test_rewards_change_nothing():
-    """Whichever rewards a configuration has, and whether or not a goal was reached, gradient steps are the same bit for bit."""
+    """Gradient steps are bit-identical for different rewards, whether or not a goal was reached."""
     agents = []
     for positive in (0.0, 5.0):
         program = make_train_step(probes.GoWhereTold(), preset("debug", algorithm="contrastive", reward_positive=positive))

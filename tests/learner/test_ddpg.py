@@ -134,7 +134,7 @@ def filtering(positive=None, negative=None):
 
 @pytest.mark.parametrize("rewards", [(), (0.0, -1.0)])
 def test_a_fresh_filter_drops_nothing(rewards):
-    """At initialisation no negative is dropped, under +1/-1 and under 0/-1 (there the critic must start below the band)."""
+    """No negative is dropped at initialisation, under +1/-1 and under 0/-1 (there the critic must start below the band)."""
     program = filtering(*rewards)
     _, metrics = train_iteration(program, begin(program, KEYS))
     assert metrics["train/filtered_share"][0] == 0.0
@@ -181,7 +181,7 @@ def test_replay_is_written_in_place():
 
 @pytest.mark.parametrize(("interval", "updates"), [(1, 1), (3, 2), (3, 3)])
 def test_targets_follow_once_an_interval(interval, updates):
-    """Not before an interval of updates has passed, and then towards the online networks of that step."""
+    """Targets move only after an interval of updates has passed, and then towards the online networks of that step."""
     config = preset("debug", num_envs=4, batch_size=8, target_update_interval=interval, target_decay=0.9)
     program = make_train_step(probes.GoWhereTold(), config.replace(updates_per_iteration=updates))
     first = jax.device_get(begin(program, KEYS).train.agent)
@@ -275,7 +275,7 @@ CHEAPER = {
 
 @pytest.mark.parametrize("options", CHEAPER.values(), ids=CHEAPER)
 def test_saved_encoders_are_not_there(options):
-    """No second encoder, none of targets."""
+    """With shared encoders, the actor has none of its own; without target encoders, the target critic has none."""
     program = make_train_step(probes.SeenGoWhereTold(), preset("debug", **options))
     agent = jax.eval_shape(program.init, jax.random.key(7)[None]).train.agent
     assert ("encoder" in agent.actor) == (options.get("encoders") != "shared")
@@ -291,7 +291,7 @@ def test_policy_learns_from_images_with_fewer_encoders():
 
 
 def test_a_shared_encoder_learns_nothing_from_the_actor():
-    """Whatever the actor's step size, the critic and its encoder take the same first steps."""
+    """The critic and its encoder take the same first steps for any step size of the actor."""
 
     def critic_after(learning_rate):
         config = preset("debug", encoders="shared", actor_learning_rate=learning_rate, batch_size=8, updates_per_iteration=1)
@@ -317,7 +317,7 @@ def test_the_actor_steps_once_an_interval():
 
 
 def test_a_target_sums_the_rewards_of_several_steps():
-    """With as many steps as the episode has, the critic needs no targets to know the value three steps away."""
+    """The critic needs no targets to know the value three steps away if it sums as many rewards as the episode has steps."""
     program, train, _ = trained(probes.ThreeStepsAway(), n_step=4, target_decay=1.0, iterations=25)
     # Targets never learn: what they add is the fresh critic's value, which is near 0, after the episode's end.
     expected = [-1.0 - DISCOUNT, -1.0, 0.0]

@@ -37,7 +37,7 @@ def test_flow_agrees_with_opencv_on_our_images(size):
 
 
 def test_flow_is_the_displacement_to_the_right_and_down():
-    """Also of images that are not square; what moves by half the window is found, too, from the coarser image."""
+    """Images need not be square; displacements of half the window are found, too, from the coarser image."""
     rng = np.random.default_rng(0)
     scene = scipy.ndimage.gaussian_filter(rng.uniform(size=(90, 120)), 3)
     scene = np.float32(255 * (scene - scene.min()) / np.ptp(scene))
@@ -53,7 +53,7 @@ def test_flow_is_the_displacement_to_the_right_and_down():
 
 
 def test_flow_is_finite_where_it_is_not_determined():
-    """Neither a flat image nor straight stripes, nor noise without any relation to what came before, say what moved."""
+    """The flow of a flat image, straight stripes, and noise unrelated to the image before is not determined."""
     rng = np.random.default_rng(0)
     flat, stripes = np.full((16, 16), 200), np.tile(np.array([0, 0, 255, 255]), (16, 4))
     noise = rng.integers(0, 256, (2, 16, 16))

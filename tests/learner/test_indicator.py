@@ -127,7 +127,7 @@ def test_mistakes_get_one_line(tmp_path):
 
 
 def test_an_algorithm_of_ones_own_learns_from_recordings():
-    """Behaviour cloning: actions in these episodes lead where the next image shows, whatever came before."""
+    """Behaviour cloning works: actions in these episodes lead where the next image shows, whatever came before."""
     observations, actions, goals, _ = record(60)
     algorithm = "benchmarks.tasks.behaviour_cloning:make"
     learner = indicator.Learner((SIZE, SIZE, 1), 1, HORIZON, algorithm=algorithm, balance_probability=1.0, **OPTIONS)

@@ -237,7 +237,7 @@ def test_false_rewards_have_their_shares_where_they_belong(clutter):
 
 @pytest.mark.parametrize("first", [0, 1, 2])
 def test_the_clutter_ends_where_the_share_of_stored_goals_does(first):
-    """Also where the ring was not written from its beginning on, as after a resumption without the replay."""
+    """The ring may also be written from another position than its beginning, as after a resumption without the replay."""
     config = validate(preset("debug", reward_clutter=0.5, reward_false_positives=0.1))
     replay = Replay(num_rollouts=3, num_envs=2, horizon=5)
     state = replay.init(jax.ShapeDtypeStruct((2,), jnp.float32), goal_state_size=1, action_size=1)

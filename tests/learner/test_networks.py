@@ -249,7 +249,7 @@ def test_losses_by_hand():
 
 @pytest.mark.parametrize(("log_of", "expected"), [("value", np.log(7.0) + 0.25), ("loss", np.log(7.25))])
 def test_the_logarithm_of_an_actors_loss_by_hand(log_of, expected):
-    """Of a value whose distance from the best is 7, and a mean squared action of 0.5 that weighs 0.5."""
+    """The value's distance from the best is 7, and the mean squared action is 0.5, with a weight of 0.5."""
     value, action = jnp.array([2.0, 4.0]), jnp.array([[1.0], [0.0]])
     np.testing.assert_allclose(losses.actor_loss(value, action, 0.5, 10.0, log_of=log_of), expected, rtol=1e-6)
 

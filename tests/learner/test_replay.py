@@ -108,7 +108,7 @@ def test_after_an_emptied_ring_only_new_episodes_are_sampled():
 
 
 def test_an_episode_takes_one_frame_a_step_and_two_more():
-    """At most (T+2)/T frames and 64 bytes a transition."""
+    """A transition takes at most (T+2)/T frames and 64 bytes."""
     replay = make_replay(1000, 4, 50)
     image = jax.ShapeDtypeStruct((4, 64, 64), jnp.uint8)
     per_transition = num_bytes(replay.spec(image, 3, 4)) / (replay.num_episodes * 50)

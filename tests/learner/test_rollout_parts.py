@@ -37,7 +37,7 @@ def programs(program: TrainStep) -> Programs:
 
 @pytest.fixture(scope="module")
 def whole(program: TrainStep) -> Programs:
-    """As on a GPU: all environments are played at once, and an evaluation has a program of its own."""
+    """Return the programs for a GPU: all environments are played at once, and an evaluation has a program of its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(train_step, "targets_cpu", lambda: False)
         return Programs(CONFIG, make_train_step(program.env, CONFIG))
@@ -98,7 +98,7 @@ def test_rollouts_are_the_same_and_explore(program: TrainStep, programs: Program
 
 
 def test_a_gpu_plays_all_at_once(program: TrainStep, programs: Programs, whole: Programs) -> None:
-    """And evaluates with a program of its own."""
+    """Evaluations on a GPU have a program of their own."""
     assert (program.part_size, program.plays_parts) == (5, True)
     assert set(programs.names) == {"play", "learn", "init", "nonfinite_leaves", "keys"}
     assert (whole.program.part_size, whole.program.plays_parts) == (CONFIG.run.num_envs, False)

@@ -33,7 +33,7 @@ from jaxrl_vis.types import Batch, Episodes, ReplayState, TrainState
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What `several_devices` has found, on four devices of this CPU."""
+    """Results of `several_devices` on four devices of this CPU."""
     tests = Path(__file__).parents[1]
     paths = (tests, tests.parent, tests.parent / "envs")
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
@@ -152,7 +152,7 @@ def test_statistics_of_parts_are_those_of_the_whole() -> None:
 
 
 def test_each_part_takes_its_own_transitions_of_a_batch() -> None:
-    """Drawn for the whole learner, so that a batch in two parts has all the numbers that one part would have."""
+    """Numbers are drawn for the whole learner, so that a batch in two parts has all those that one part would have."""
     config = validate(preset("debug", batch_size=12))
     replay = Replay(num_rollouts=2, num_envs=3, horizon=5)
     state = ReplayState(Episodes(*(jnp.zeros((6, 7, 2)) for _ in range(3))), jnp.int32(6))
@@ -239,7 +239,7 @@ def make_batch(config: Config) -> Batch:
     ids=lambda changes: changes.get("weighting", changes["method"]),
 )
 def test_gradients_and_metrics_of_parts_are_those_of_the_whole_batch(changes: dict[str, Any]) -> None:
-    """Whatever a weighting or a filter makes of losses and gradients, it makes of those of the whole batch."""
+    """Weightings and filters see the losses and gradients of the whole batch."""
     config = validate(preset("debug", batch_size=SIZE, updates_per_iteration=10, compute_dtype="float32", **changes))
     batch = jax.jit(functools.partial(make_batch, config))()
     train = jax.jit(functools.partial(make_learner, config))()

@@ -26,7 +26,7 @@ ENVS, SETTINGS = 2, {"batch_size": 64, "updates_per_iteration": 1, "replay_trans
 
 
 def test_relabelled_goals_repeat_the_achieved_image():
-    """VisualReacher's own rule, on episodes whose images encode their number and their slot, newest first."""
+    """VisualReacher's own rule is applied to episodes whose images encode their number and their slot, newest first."""
     env = jaxrl_vis_envs.make("VisualReacher", frame_stack=2, image_size=4, pixels="depth")
     horizon = 5
     slots = np.arange(horizon + 2)
@@ -143,7 +143,7 @@ def test_people_are_shown_the_newest_image():
 
 
 def test_a_single_image_is_left_alone():
-    """With one image there is nothing to do, and nothing is done."""
+    """`as_goal` is not called if the observation is a single image, which is a goal already."""
 
     class Rigid(Walker):
         def as_goal(self, observation):

@@ -126,7 +126,7 @@ def test_a_step_is_that_of_mujoco():
 
 
 def test_a_step_of_the_push():
-    """Beside C MuJoCo less the weld's term, whose boxes also touch with edges."""
+    """Steps are compared with C MuJoCo's less the weld's term, in which boxes also touch with edges."""
     env = environments.make("FetchPush")
     visited = one_step.push_states(env)
     place = env.mj_model.joint("box").qposadr[0]
@@ -171,7 +171,7 @@ def test_the_probe_is_a_kernel_for_nvidia():
 
 
 def test_inputs_table_and_outputs_of_a_warp():
-    """Through the interpreter, over two axes of episodes."""
+    """The kernel runs in the interpreter, over two axes of episodes."""
     table = np.arange(2.0 * LANES).reshape(2, LANES)
 
     def compute(factor, inputs, rows):

@@ -26,7 +26,7 @@ def test_the_solution_of_small_systems():
 
 
 def test_one_matrix_for_many_right_sides():
-    """Over axes that only one of the two has."""
+    """Right sides have a batch axis that the matrices lack."""
     rng = np.random.default_rng(0)
     roots, right = rng.normal(size=(3, 4, 4)), rng.normal(size=(3, 5, 4))
     matrices = roots @ roots.transpose(0, 2, 1) + np.eye(4)
@@ -36,7 +36,7 @@ def test_one_matrix_for_many_right_sides():
 
 
 def test_derivatives_of_the_solution_of_small_systems():
-    """In both directions, of batches, and where only the tangents are a batch, as in `jax.jacfwd`."""
+    """Forward and reverse derivatives of batches are correct, even if only the tangents are a batch, as in `jax.jacfwd`."""
     rng = np.random.default_rng(0)
     roots, right = rng.normal(size=(3, 4, 4)), rng.normal(size=(3, 4))
     matrices = roots @ roots.transpose(0, 2, 1) + np.eye(4)
@@ -59,7 +59,7 @@ def test_a_control_step_can_be_differentiated_in_both_directions():
 
 
 def test_the_line_search_finds_the_least_cost():
-    """Over parabolas of 1 to 100 constraints, some of them equalities, some that the line does not touch."""
+    """Costs are sums of parabolas of 1 to 100 constraints; some are equalities, some do not change along the line."""
     rng = np.random.default_rng(1)
     lengths = np.linspace(0, 10, 100_001)
     search = jax.jit(newton._line_search)
@@ -78,14 +78,14 @@ def test_the_line_search_finds_the_least_cost():
 
 
 def test_nothing_moves_where_nothing_pulls():
-    """As where no constraint acts: the direction is 0, and so is the curvature along it."""
+    """Where no constraint acts, the direction is 0, and so is the curvature along it."""
     still = jnp.zeros(2)
     length = newton._line_search(still, still, jnp.ones(2), np.array([False, True]), jnp.float32(0), jnp.float32(0))
     assert np.isfinite(length)
 
 
 def test_a_step_is_that_of_mjx():
-    """With forces from outside, from configurations beyond the limits of the joints and with the fingers in the table."""
+    """There are external forces, joints beyond their limits, and fingers in the table."""
     env = environments.make("FetchReach")
     mj_model = copy.copy(env.mj_model)
     mj_model.opt.iterations, mj_model.opt.ls_iterations = 20, 20
@@ -168,7 +168,7 @@ def test_the_engine_of_each_task(name):
 
 
 def test_without_warm_starts_the_last_accelerations_do_not_matter():
-    """The reacher's elbow near its limit, with one iteration, from a warm start that is far off; against MJX."""
+    """The reacher's elbow is near its limit, and the last accelerations are far off; one iteration gives MJX's step."""
     mj_model = copy.copy(environments.make("Reacher").mj_model)
     mj_model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER  # four forward dynamics in a program take long to compile
     assert mj_model.opt.iterations == 1 and mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART

@@ -61,7 +61,7 @@ def test_pushes_that_move_nothing_are_found_out():
 
 
 def test_a_step_of_the_push():
-    """Nine tenths of the states as C MuJoCo less the weld's term has them; the rest touch with edges."""
+    """Nine tenths of the states match C MuJoCo less the weld's term; in the others, boxes touch with edges."""
     env = environments.make("FetchPush")
     states = one_step.push_states(env)
     theirs = one_step.mujoco_step(env.mj_model, states, weld_term=False)
@@ -92,7 +92,7 @@ def test_contacts_matter_to_the_hand():
 
 
 def test_a_step_of_the_fetch_robot():
-    """Against C MuJoCo less a term of welds that MJX lacks, and against C MuJoCo as it is."""
+    """Steps are compared with C MuJoCo less a term of welds that MJX lacks, and with C MuJoCo as it is."""
     env = environments.make("FetchReach")
     states = one_step.fetch_states(env)
     less = one_step.mujoco_step(env.mj_model, states, weld_term=False)

@@ -139,7 +139,7 @@ def test_a_problem_without_damping_has_no_other_accelerations():
 
 
 def test_a_matrix_that_fills_in_is_divided_by():
-    """The mass matrix of a tree, and squares and products of rows that tie its branches."""
+    """The matrix is the mass matrix of a tree, plus squares of rows that couple its branches."""
     rng = np.random.default_rng(2)
     given = problems(1)
     matrix = {place: jnp.float32(given.mass[0][place]) for place in MASS}
@@ -153,7 +153,7 @@ def test_a_matrix_that_fills_in_is_divided_by():
 
 
 def test_dry_friction_is_not_jumped_over():
-    """A slope that turns within a thousandth of the line, between two flat stretches, whose own zeros are outside of it."""
+    """The slope turns within a thousandth of the line, between two flat stretches whose own zeros are outside of it."""
 
     def slope_at(length):
         knee = jnp.clip(1000.0 * (length - 0.3), -1.0, 1.0)
@@ -177,7 +177,7 @@ def lowest_over_parabolas(residual, along, stiffness, first, second, in_kernel):
 
 @pytest.mark.parametrize("in_kernel", [False, True])
 def test_the_line_search_finds_the_least_cost(in_kernel):
-    """Over parabolas of 1 to 12 constraints that start or end along the line."""
+    """Costs are sums of parabolas of 1 to 12 constraints that become active or inactive along the line."""
     rng = np.random.default_rng(1)
     lengths = np.linspace(0, 40, 400_001)
     for rows in (1, 3, 12) * 8:
@@ -194,7 +194,7 @@ def test_the_line_search_finds_the_least_cost(in_kernel):
 
 @functools.cache
 def problem_of_the_hand() -> Problem:
-    """That of its first step, of which tests use the structure."""
+    """Return the problem of the hand's first step; tests use its structure."""
     env = environments.make("HandReach")
     constants = scalar_model.build_scalar_model(env._model)
     start = env.sample_start(jax.random.key(0))

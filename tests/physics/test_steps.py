@@ -167,7 +167,7 @@ def by_matrices(name: str, count: int):
 
 
 def repeated(data: mjx.Data, count: int) -> mjx.Data:
-    """So many copies, made on the host: on a device each size of leaf would be a program to compile."""
+    """Return ``count`` copies, made on the host: on a device, each size of leaf would be a program to compile."""
     return jax.tree.map(lambda leaf: np.tile(leaf, (count,) + (1,) * leaf.ndim), jax.device_get(data))
 
 
@@ -253,7 +253,7 @@ def odd_states(mj_model: mujoco.MjModel, count: int) -> mjx.Data:
 
 @pytest.mark.parametrize("warmstart", ["enable", "disable"])
 def test_a_step_of_a_model_with_everything(warmstart):
-    """Limits, dry friction, springs, tendons, servos, contacts with friction and without, and joints along any axis."""
+    """The model has limits, dry friction, springs, tendons, servos, contacts of both kinds, and joints along any axis."""
     mj_model = odd_model(warmstart)
     model = mjx.put_model(mj_model)
     assert scalar.supports(model)
@@ -290,7 +290,7 @@ def reacher_states(count: int) -> mjx.Data:
 @pytest.mark.parametrize("integrator", ["mjINT_EULER", "mjINT_RK4"])
 @pytest.mark.parametrize("name", ["Reacher", "FingerTurn", "HandReach"])
 def test_a_step_is_that_of_mujoco(name, integrator, monkeypatch):
-    """In double precision. A step of the Runge-Kutta method has four solutions of the constraints."""
+    """Both compute in double precision. A step of the Runge-Kutta method solves the constraints four times."""
     mj_model = copy.copy(environments.make(name).mj_model)
     mj_model.opt.integrator = getattr(mujoco.mjtIntegrator, integrator)
     mj_model.opt.iterations, mj_model.opt.ls_iterations, mj_model.opt.tolerance = 100, 100, 0
@@ -322,7 +322,7 @@ def test_a_step_is_that_of_mujoco(name, integrator, monkeypatch):
 
 
 def test_the_kernel_of_runge_kutta_takes_the_steps_of_mjx():
-    """Those that the reacher has on a GPU and on a CPU, its own number of iterations included."""
+    """The interpreted kernel takes the reacher's steps as MJX does, with the task's own number of iterations."""
     env, data = environments.make("Reacher"), reacher_states(48)
     assert env.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     matrices = functools.partial(mjx_model.take_steps, env._model, count=REACHER_SUBSTEPS)
@@ -383,7 +383,7 @@ def test_scalar_models_are_the_same_where_their_fingerprints_are():
 
 @pytest.mark.parametrize("name", ["HandReach", "FingerTurn", "Reacher", "odd"])
 def test_masses_and_bias_forces_are_those_of_mujoco(name, monkeypatch):
-    """In double precision, but for what MJX has rounded of the model."""
+    """Both compute in double precision, except for the model, which MJX rounds."""
     monkeypatch.setattr(partial_arithmetic, "jnp", np)
     mj_model = copy.copy(odd_model() if name == "odd" else environments.make(name).mj_model)
     mj_model.tendon_armature[:] = 0
@@ -420,7 +420,7 @@ def test_sine_and_cosine():
 
 
 def test_the_kernel_takes_the_same_steps():
-    """Two axes of episodes, as in training: seeds and environments."""
+    """Episodes have two axes, as in training: seeds and environments."""
     env, many_steps = by_matrices("FingerTurn", 3)
     start, end = states("FingerTurn"), many_steps(states("FingerTurn"))
     data, after = (jax.tree.map(lambda leaf: leaf[:6], jax.device_get(each)) for each in (start, end))
@@ -460,7 +460,7 @@ def test_all_steps_of_a_task_are_one_kernel_for_nvidia(name, monkeypatch):
 
 
 def test_goals_and_steps_of_the_hand_are_one_kernel(monkeypatch):
-    """Which XLA compiles once, as the code is the same to the last letter: number, length and exactness of steps are inputs."""
+    """XLA compiles equal code once: the number, length and exactness of steps are inputs of the kernel."""
     monkeypatch.delenv(KERNELS_VARIABLE, raising=False)
     env = environments.make("HandReach")
 
@@ -509,7 +509,7 @@ def test_a_model_whose_numbers_vary_has_none():
 
 
 def test_an_order_that_fills_in_little():
-    """A chain that hangs on the first joint, and two more that a constraint ties; leaves are eliminated first."""
+    """Leaves are eliminated first, in a chain that hangs on the first joint, and in two more that a constraint ties."""
     mass = [(0, 0), (1, 1), (1, 0), (2, 2), (2, 1), (2, 0), (3, 3), (3, 0), (4, 4), (4, 0)]
     order = steps.elimination_order(5, mass, [(3, 4), (1,)])
     assert sorted(order) == [0, 1, 2, 3, 4]

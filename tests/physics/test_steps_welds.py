@@ -167,7 +167,7 @@ def test_a_control_step_of_each_task_is_that_of_matrices(name):
 
 
 def test_the_kernel_takes_the_same_steps():
-    """Two axes of episodes, as in training: seeds and environments."""
+    """Episodes have two axes, as in training: seeds and environments."""
     env, step = by_matrices("SawyerReach")
     start = states("SawyerReach")
     end = step(start, 3)
@@ -238,7 +238,7 @@ def test_steps_do_not_take_welds_of_sites():
 
 
 def test_places_of_welded_bodies():
-    """Against MuJoCo's kinematics, with joints that turn more than once."""
+    """Poses are compared with MJX's kinematics, with joints that turn more than once."""
     mj_model = odd_model()
     model = mjx.put_model(mj_model)
     data = odd_states(mj_model, 20)

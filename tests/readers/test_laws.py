@@ -35,7 +35,7 @@ def replay_programs(mean_age: int | None):
 
 @pytest.mark.parametrize("mean_age", [None, ENVS * HORIZON])
 def test_replays_give_what_was_put_in(mean_age):
-    """Wherever in its ring a run begins: transitions of stored episodes alone, whole, with goals of their own episode."""
+    """From any beginning in the ring, transitions are of stored episodes alone, whole, and with goals of their own episode."""
     _, empty, insert, sample, gather, is_stored = replay_programs(mean_age)
 
     @given(st.integers(0, 1000), st.integers(1, 5), seeds, st.data())
@@ -110,7 +110,7 @@ def rule(name):
 
 @pytest.mark.parametrize("name", sorted(RULES))
 def test_weights_are_finite_not_negative_and_nobodys_by_name(name):
-    """Whatever the losses and the gradients' products are; and losses that exchange their names exchange their weights."""
+    """The law holds for any losses and products of gradients; losses that exchange names exchange their weights."""
 
     @given(
         st.lists(st.tuples(*[losses] * 4), min_size=3, max_size=3),
@@ -186,7 +186,7 @@ def test_lenses_of_an_angle_of_view_are_pinholes(fovy):
 
 @given(*[st.floats(0.005, 0.1)] * 2, *[st.floats(-0.01, 0.01)] * 2)
 def test_lenses_of_a_sensor_put_its_principal_point_ahead(focal_x, focal_y, right, down):
-    """As the matrix of such a camera projects: u = (column - c) / f, of pixels that the sensor's size makes of metres."""
+    """Rays are those of the camera's matrix: u = (column - c) / f, in pixels, which the sensor's size converts to metres."""
     scene = scene_of('focal=".02 .02" sensorsize=".03 .02" resolution="20 12"')
     scene = scene.replace(focal=jnp.float32([focal_x, focal_y]), principal=jnp.float32([right, down]))
     _, (u, v) = jax.device_get(rays_of(scene))

@@ -194,7 +194,7 @@ def test_a_file_that_is_larger_than_its_pixels_is_not_read(tmp_path):
 
 
 def test_pngs_keep_what_belongs_to_their_pixels(tmp_path):
-    """Palettes and transparency, and text of other programs left out."""
+    """Palettes and transparency are kept; text of other programs is left out."""
     extra = chunk(b"tEXt", b"Comment\0of a camera")
     (tmp_path / "a.png").write_bytes(png(20, 12, extra))
     assert (read_image(tmp_path / "a.png") == 0).all()

@@ -126,7 +126,7 @@ def _sections(tree, mark: str) -> str:
 
 
 def test_calibrations_of_other_programs(worker):
-    """kalibr, RealSense, Middlebury, KITTI, ZED, and the older form of ROS."""
+    """Calibrations are those of kalibr, RealSense, Middlebury, KITTI, ZED, and the older form of ROS."""
     chains = also_as_text(
         trees(KALIBR).map(lambda tree: yaml_text(json.loads(json.dumps(tree)))), yaml_text(json.loads(json.dumps(KALIBR)))
     )
@@ -249,7 +249,7 @@ TURNED = {**VOC, "object": [{"name": "stalk", "robndbox": {"cx": 15.0, "cy": 25,
 
 
 def test_annotations_of_other_programs(worker):
-    """Label Studio, LabelMe's masks, YOLO, CVAT and roLabelImg."""
+    """Annotations are those of Label Studio, LabelMe with masks, YOLO, CVAT and roLabelImg."""
     studio = also_as_text(trees(LABEL_STUDIO).map(json_text), json_text(LABEL_STUDIO))
     painted = also_as_text(trees(PAINTED).map(json_text), json_text(PAINTED))
     rows = trees(YOLO).map(lambda tree: "\n".join(" ".join(map(str, row)) for row in tree if isinstance(row, list)))
@@ -372,7 +372,7 @@ _ENDS = (".png", ".JPG", ".tiff", ".pfm", ".csv", "")
 
 
 def test_names_of_images(worker):
-    """Any names in any folders; the files are empty."""
+    """Files may have any names in any folders; they are empty."""
     stem = st.lists(st.sampled_from(_WORDS), min_size=1, max_size=4).map("".join)
     name = st.tuples(stem, st.sampled_from(_ENDS)).map("".join)
     folders = ("", "", "left/", "right/", "L/", "R/", "plot/", "a/b/", "disparity/", "cam0/", "cam1/data/", "image_02/")

@@ -21,7 +21,7 @@ ABOUT = {"task": "VisualThing", "control_period": 0.04, "frame_stack": 1, "depth
 
 
 def episodes(channels: int, frame_stack: int = 1) -> Episodes:
-    """As a rollout returns them; images are noise, which only a lossless format keeps."""
+    """Return episodes in the form of a rollout's; images are noise, which only a lossless format keeps."""
     draw = np.random.default_rng(channels)
     shape = (COUNT, STEPS + 2, channels * frame_stack, SIZE, SIZE) if channels else (COUNT, STEPS + 2, 5)
     seen = draw.integers(0, 256, shape).astype(np.uint8) if channels else draw.normal(size=shape).astype(np.float32)
@@ -105,7 +105,7 @@ def test_the_indicator_learns_from_a_dataset_as_from_its_npz(tmp_path: Path) -> 
 
 
 def test_the_dataset_has_the_schema_of_lerobot(tmp_path: Path) -> None:
-    """Files, columns and types as lerobot 0.4.4 writes and reads them."""
+    """Files, columns and types are those that lerobot 0.4.4 writes and reads."""
     pytest.importorskip("av")
     parquet = pytest.importorskip("pyarrow.parquet")
     import pandas as pd

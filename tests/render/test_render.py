@@ -322,7 +322,7 @@ def test_only_requested_planes_are_returned(ball):
     ("height", "width", "said"), [(-1, 4, "height=-1"), (4, 5.5, "width=5.5"), (4, 9999, "offwidth of the")]
 )
 def test_sizes_mujoco_cannot_render_raise_one_line(ball, height, width, said):
-    """Checked before GL is initialised."""
+    """The size is checked before GL is initialised."""
     with pytest.raises(ValueError, match=said) as refusal:
         ReferenceRenderer(ball[0], height, width)
     assert "\n" not in str(refusal.value)

@@ -64,7 +64,7 @@ def test_passes_render_meshes_as_the_plain_renderer_does(given: dict[str, str], 
 
 @pytest.mark.parametrize("lens", ["", ORTHOGRAPHIC], ids=["perspective", "orthographic"])
 def test_rasterization_finds_the_triangles_that_the_plain_search_finds(lens: str) -> None:
-    """In two images; the second lacks one of two meshes that coincide. One mesh is cut by the near plane."""
+    """The second of two images lacks one of two meshes that coincide. One mesh is cut by the near plane."""
     scene, mj_model, poses = prepared(lens)
     later, earlier = (scene.object_ids.index(mj_model.geom(name).id) for name in ("later", "earlier"))
     places = jnp.stack([poses.geom_xpos, poses.geom_xpos.at[mj_model.geom("later").id].set(jnp.nan)])
@@ -88,7 +88,7 @@ def test_rasterization_finds_the_triangles_that_the_plain_search_finds(lens: str
 
 
 def test_lists_of_several_images_are_independent() -> None:
-    """Cameras, poses and meshes that differ along two axes of a batch."""
+    """Cameras, poses and meshes differ along two axes of a batch."""
     scene, _, poses = prepared()
     outputs = Outputs(rgb=False, depth=True)
     fovy = jnp.array([40.0, 25.0, 60.0])

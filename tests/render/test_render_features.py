@@ -85,7 +85,7 @@ def test_an_orthographic_camera():
 
 
 def test_orthographic_camera_culls_planes_like_mujoco():
-    """Found by benchmarks/render_parity.py (camera_ortho, pose 12 of seed 0): position and direction must agree on the side."""
+    """Regression test (render_parity.py, camera_ortho, pose 12 of seed 0): position and direction must agree on the side."""
     planes = "".join(
         f'<geom type="plane" size=".5 .5 .1" pos="{x} 0 0" zaxis="{normal}"/>'
         for x, normal in ((-2, ".9 0 -.3"), (0, ".9 0 .3"), (2, ".9 0 .3"))
@@ -342,7 +342,7 @@ def free_view(**changes: float) -> mujoco.MjvCamera:
 
 
 def test_free_camera_pose_matches_mujoco() -> None:
-    """Looking along +y from 2 m in front of the centre: the box, half a metre to the right, appears on the right."""
+    """The camera looks along +y from 2 m in front of the centre: the box, half a metre to the right, appears on the right."""
     box = "<geom type='box' pos='.5 0 .5' size='.1 .1 .1'/>"
     mj_model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{box}</worldbody></mujoco>")
     mj_data = mujoco.MjData(mj_model)

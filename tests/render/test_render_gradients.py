@@ -182,7 +182,7 @@ def test_nan_pose_does_not_spoil_other_gradients(name):
 
 
 def test_gradient_descent_finds_a_pose():
-    """The pose of a ball, from a depth image alone."""
+    """The pose of a ball is found from a depth image alone."""
     scene, poses, _ = setting("primitives")
     thing = 1 + SCENES["primitives"].index("sphere")
 

@@ -120,7 +120,7 @@ def test_capsules_and_colours_are_those_of_the_visualizer(name: str) -> None:
 
 
 def test_both_courses_occur_in_the_poses() -> None:
-    """Of what the test above compares: tendons with and without contact, slack and taut, within a limit and beyond it."""
+    """The test above compares tendons with and without contact, slack and taut, within a limit and beyond it."""
     names = ("ball", "ball_above", "ball_beside", "ball_inside", "rod", "rod_beside", "hanging")
     numbers: dict[str, set[Any]] = {name: set() for name in names}
     for name, seen in numbers.items():

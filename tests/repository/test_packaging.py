@@ -209,7 +209,7 @@ def test_importing_the_package_loads_no_jax(clean_environment: dict[str, str]) -
 
 
 def test_mjx_does_not_print_that_warp_is_missing(clean_environment: dict[str, str]) -> None:
-    """Neither importing our modules prints it, nor importing MJX after them."""
+    """The message is printed neither by importing our modules, nor by importing MJX after them."""
     for code in ("import jaxrl_vis_envs.physics; from mujoco import mjx", "import jaxrl_vis_envs.adapters.brax_viewer"):
         done = subprocess.run([sys.executable, "-c", code], env=clean_environment, capture_output=True, text=True)
         assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr

@@ -84,7 +84,7 @@ def test_a_light_save_survives_donation(tmp_path):
 
 
 def test_a_clock_that_is_set_stops_no_save(tmp_path, monkeypatch):
-    """By a day whenever somebody looks at it: orbax measures its timeouts with it."""
+    """The clock, with which orbax measures its timeouts, advances by a day at each reading."""
     trainer = make_fake_trainer(small_config(), None)
     loop, _ = trainer.train_iteration(trainer.init(jax.random.key(0)))
     checkpoints, days, right = Checkpoints(tmp_path), itertools.count(), time.time

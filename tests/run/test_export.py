@@ -176,7 +176,7 @@ def test_a_policy_of_one_s_own_leaves_as_stablehlo(runs: dict, tmp_path: Path) -
 
 
 def test_stacked_images_are_put_together_as_the_task_does() -> None:
-    """From images of 2 channels, 8 episodes of 3 steps; pixels count the steps, goals are 100."""
+    """There are 8 episodes of 3 steps with images of 2 channels; pixels count the steps, goals are 100."""
     images = np.broadcast_to(np.arange(4)[None, None, :, None, None, None], (1, 8, 4, 2, 3, 3)).astype(np.uint8)
     recorded = {"frames": images, "goals": np.full((1, 8, 2, 3, 3), 100, np.uint8)}
     programs = types.SimpleNamespace(evaluate=lambda train: ({}, recorded))
@@ -200,7 +200,7 @@ def test_stacked_images_are_put_together_as_the_task_does() -> None:
 
 
 def run_block(page: Path, file: str, folder: Path, missing: tuple[str, ...]) -> str:
-    """What a script of the page prints, in a process that cannot import some packages."""
+    """Return the output of a script of the page, in a process that cannot import some packages."""
     (block,) = [text for text in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL) if f"# file: {file}\n" in text]
     script = folder.parent / file
     script.write_text(block)

@@ -96,7 +96,7 @@ def test_tasks_without_poses_are_refused(policy: Policy) -> None:
 
 
 class Handle(types.SimpleNamespace):
-    """What a call of viser adds to the page: its arguments, and what is called when somebody uses it."""
+    """Object that a call of viser adds to the page: its arguments, and the functions called when somebody uses it."""
 
     def on_click(self, call: Any) -> None:
         self.use = call
@@ -105,7 +105,7 @@ class Handle(types.SimpleNamespace):
 
 
 class Server:
-    """As much of `viser.ViserServer` as a page uses. viser itself is tried where it is installed, below."""
+    """Stand-in for the part of `viser.ViserServer` that a page uses. viser itself is tried where it is installed, below."""
 
     def __init__(self) -> None:
         self.added: dict[str, Handle] = {}

@@ -179,7 +179,7 @@ def test_whoever_was_taken_for_dead_saves_nothing_any_more(tmp_path, no_locks):
 
 
 def test_locks_of_both_kinds_see_each_other(tmp_path, no_locks, monkeypatch):
-    """As on a file system that has locks for one host only, or a folder whose last holder was an earlier version."""
+    """A file system may have locks for one host only, and a folder's last holder may have been an earlier version."""
     said: list[str] = []
     with run_lock(tmp_path, said.append):
         monkeypatch.undo()  # for this process there are locks
@@ -202,7 +202,7 @@ def test_locks_of_both_kinds_see_each_other(tmp_path, no_locks, monkeypatch):
 
 
 def test_a_lock_of_the_system_leaves_another_ones_file_alone(tmp_path):
-    """As where the folder was moved, and another run started under its name."""
+    """The file is another run's if the folder was moved, and another run started under its name."""
     with run_lock(tmp_path):
         (tmp_path / FILE_NAME).unlink()
         Path(tmp_path / FILE_NAME).write_text("another")

@@ -120,7 +120,7 @@ def test_both_show_what_the_run_has_written(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_resumed_run_shows_each_evaluation_once(tmp_path: Path) -> None:
-    """Abandoned after iteration 7, saved at 3: rows after 3 are cut back and written again. The loggers go on unasked."""
+    """The run is abandoned after iteration 7 and resumed from 3: rows after 3 are written again. Loggers go on unasked."""
     path = tmp_path / "run"
     config = small_config(full_checkpoint_interval=3, checkpoint_interval=3)
     for report in make_fake_trainer(config, path, log=("wandb", "tensorboard")).run():

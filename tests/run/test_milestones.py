@@ -100,7 +100,7 @@ def test_a_resumed_run_keeps_the_same_best(cut: int, straight: Path, make: Calla
 
 
 def test_a_run_that_goes_back_meets_its_best_again(straight: Path, make: Callable[..., Trainer], tmp_path: Path) -> None:
-    """Left after the best one, resumed from before it."""
+    """The run is abandoned after the best evaluation, and resumed from before it."""
     path = tmp_path / "run"
     options = {"full_checkpoint_interval": 3, "checkpoint_interval": 3}
     for report in make(path, **options).run():

@@ -95,7 +95,7 @@ def test_a_run_shows_what_it_predicts(
 def test_what_cannot_be_shown_is_refused_in_one_line(
     changes: dict, words: list[str], parts: list[str], here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """From the configuration alone: nothing was trained here, and nothing is compiled."""
+    """The configuration alone decides: nothing was trained here, and nothing is compiled."""
     folder = here / "run"
     config = jaxrl_vis.preset("debug", env="VisualDots", **{**SETTINGS, **changes})
     jaxrl_vis.make_trainer(config, folder).folder.open(config)

@@ -196,7 +196,7 @@ def test_examples_of_the_pages_run(page: str, runs: dict[str, Path], checkout: P
 def test_a_call_does_not_trace_the_environment_again(
     policies: dict[str, jaxrl_vis.Policy], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Which would take a hundred times as long as the policy."""
+    """Tracing the environment would take a hundred times as long as the policy."""
     policy, zero = policies["Told"], np.zeros(1, np.float32)
     policy(zero, zero)
     monkeypatch.setattr(type(policy.env), "observation_spec", property(lambda _: pytest.fail("traced again")))

@@ -36,7 +36,7 @@ def test_resumed_equals_straight_bit_for_bit(straight, tmp_path, cut, capsys):
 
 
 def test_resume_between_evaluations_goes_on_with_the_means(straight, tmp_path):
-    """Abandoned after iteration 5, saved at 3: rows after 3 are written again, with means over iterations 3 and 4."""
+    """The run is abandoned after iteration 5 and resumed from 3: rows after 3 have means over iterations 3 and 4, too."""
     path = tmp_path / "run"
     config = small_config(full_checkpoint_interval=3, checkpoint_interval=3)
     for report in make_fake_trainer(config, path).run():
@@ -157,7 +157,7 @@ def interrupted(config, path, after: int) -> None:
 
 
 def test_a_stale_full_checkpoint_destroys_nothing(tmp_path, capsys):
-    """SIGTERM, resumed to the end, resumed for more: the second part's checkpoints and rows stay."""
+    """The run gets SIGTERM, is resumed to the end, and then for more: the second part's checkpoints and rows stay."""
     path, config = tmp_path / "run", small_config(full_checkpoint_interval=0, env_steps=200)
     interrupted(config, path, 2)
     checkpoints = Checkpoints(path / "checkpoints")

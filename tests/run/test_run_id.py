@@ -41,7 +41,7 @@ def test_everything_that_a_run_writes_carries_its_id(tmp_path):
 
 
 def test_a_new_run_does_not_go_on_with_an_old_ones_checkpoints(straight, tmp_path, capsys):
-    """As where they could not be deleted: the new run is interrupted before it has come as far as they are."""
+    """The old checkpoints could not be deleted, and the new run is interrupted before it has come as far as they are."""
     path = tmp_path / "run"
     run_until_sigterm(make_fake_trainer(small_config(), path), 2)
     for tier in (LIGHT, FULL):  # later than its own

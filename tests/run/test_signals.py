@@ -113,7 +113,7 @@ def compilations():
 
 @pytest.mark.parametrize("end", ["itself", "signal", "nan"])
 def test_nothing_is_compiled_once_training_has_begun(tmp_path, compilations, end):
-    """Neither by evaluations, saves, curve and video, nor by what a signal or a broken number sets going."""
+    """Evaluations, saves, curve and video, a signal, and a number that is not finite start no compilation."""
     jax.clear_caches()
     trainer = make_fake_trainer(small_config(seeds=3), tmp_path / "run", nan_at=5 if end == "nan" else None)
     results = compilations(trainer)
@@ -128,7 +128,7 @@ def test_nothing_is_compiled_once_training_has_begun(tmp_path, compilations, end
 
 
 def test_children_that_compile_do_not_get_the_groups_signals(clean_environment):
-    """As `timeout` sends them: to the whole process group."""
+    """Signals are sent to the whole process group, as by `timeout`."""
     code = """
 import os, signal, subprocess, sys, time
 from concurrent.futures import ThreadPoolExecutor
@@ -213,7 +213,7 @@ FAULTS = ("SEGV", "BUS", "ABRT", "FPE", "ILL", "SYS", "TRAP")
 
 @pytest.fixture
 def not_ignored():
-    """As for a process that nobody started with `nohup` or in the background of a script, whatever this one is."""
+    """Handle signals as in a process started without `nohup` and not in the background of a script."""
     before = {number: signal.signal(number, signal.SIG_DFL) for number in ENDS if number != signal.SIGINT}
     before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
@@ -342,7 +342,7 @@ def test_a_signal_ends_any_other_command_in_one_line(number, monkeypatch, capsys
 
 
 def test_a_command_that_does_not_look_up_is_ended(monkeypatch, not_ignored):
-    """XLA, say, which compiles for minutes; but not a run, which is given the time that it takes to save."""
+    """XLA, say, may compile for minutes; a run, however, is given the time that it takes to save."""
     monkeypatch.setattr(signals, "_PATIENCE_S", 0.1)
     given_up: queue.Queue[int] = queue.Queue()
     with signals.Ending(given_up.put):

@@ -46,7 +46,7 @@ class Told(probes.SeenGoWhereTold):
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch) -> Iterator[Path]:
-    """Where programs are kept, which nothing turns off."""
+    """Folder in which programs of the registered tasks are kept."""
     monkeypatch.setattr(compilation, "_assumed", set())  # of kernels that other tests have let in
     monkeypatch.setitem(registry._ENTRIES, "VisualTold", registry._Entry(lambda _: Told(), PixelsConfig))
     with point_mass.registered(tmp_path):

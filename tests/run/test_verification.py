@@ -136,7 +136,7 @@ def test_each_flipped_bit_of_a_full_checkpoint_is_found(copy, verified):
 
 
 def test_a_checkpoint_of_another_state_is_found(copy, verified, run_trainer, tmp_path):
-    """One that is whole, with checksums that fit, but that this run does not arrive at."""
+    """The checkpoint is whole and its checksums fit, but this run does not arrive at its state."""
     other = tmp_path / "other"
     list(run_trainer(small_config(seed=5, env_steps=60), other).run())
     whose = {name: value for name, value in read_record(copy).items() if name == RUN_ID}

@@ -203,7 +203,7 @@ def test_files_are_read_as_opencv_reads_them(tmp_path, kind):
 
 
 def test_a_calibration_may_be_a_stream_of_documents(tmp_path):
-    """Of several documents, as printed by `rostopic echo`, the first counts."""
+    """The first of several documents counts; `rostopic echo` prints such streams."""
     path = tmp_path / "rig.yaml"
     write_calibration(path, CAMERAS)
     path.write_text(path.read_text() + "---\nP1: 7\n")

@@ -113,7 +113,7 @@ def test_a_cell_that_fails_is_told_in_one_line_and_the_others_go_on(tmp_path: Pa
 
 
 def test_a_cell_that_trained_with_other_settings_says_which(tmp_path: Path) -> None:
-    """As where another version is installed while a figure is trained: its log ends as that of any good run."""
+    """The log ends as that of any good run; another version may have been installed while a figure was trained."""
     cell = make_cell("a")
     script = Script()
 
@@ -185,7 +185,7 @@ except KeyboardInterrupt:
 
 
 def test_a_second_signal_does_not_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not even for a process that does not listen; and it leaves none behind."""
+    """After the second signal, a process that ignores SIGTERM is not waited for, and is not left running."""
     monkeypatch.setattr("jaxrl_vis.studies.engine.grid._GRACE_S", 0.5)
     cell = make_cell("a")
     pids: list[int] = []
@@ -267,7 +267,7 @@ def test_seeds_can_be_split_and_names_say_which() -> None:
 
 @pytest.mark.parametrize("name", ["paper", "fast", "cpu"])
 def test_the_command_trains_what_the_cell_says(name: str, tmp_path: Path) -> None:
-    """Also where a preset has settings of its own for a task, and a cell goes back to the general ones."""
+    """The command is right even if a preset has settings of its own for a task, and a cell restores the general ones."""
     config = preset(name, env="VisualHandReach", aux_tasks=("egomotion",), weighting="balance").replace(num_envs=100)
     words = train_command(Cell("a", config), tmp_path, True)
     assert words[1:4] == ["-m", "jaxrl_vis", "train"] and words[-1] == "--resume"
@@ -306,7 +306,7 @@ def test_devices_are_asked_for_in_a_process_of_their_own() -> None:
 
 
 def test_real_runs_are_trained_and_a_wrong_one_says_why(tmp_path: Path) -> None:
-    """By processes of their own, on a task that compiles in a moment."""
+    """Runs are trained by processes of their own, on a task that compiles in a moment."""
     own = {"env": "point_mass:PointMass", "env_folder": str(Path(__file__).parents[1]), "env_steps": 80, "seeds": 1}
     own |= {"image_size": 8, "encoder_filters": (4,), "eval_episodes": 2}  # as in test_own_tasks: it is compiled once for both
     cells = [make_cell("wrong", **own, batch_size=0), make_cell("right", **own)]

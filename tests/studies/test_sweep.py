@@ -99,7 +99,7 @@ def test_jobs_that_are_stopped_have_saved_and_go_on(tmp_path: Path) -> None:
 
 
 def test_a_job_that_is_queued_again_resumes(tmp_path: Path) -> None:
-    """As Slurm does where the time of a job is over: submitit asks what to queue in its place."""
+    """When a job's time is over under Slurm, submitit asks what to queue in its place."""
     code = "import sys, pathlib; pathlib.Path(sys.argv[1], 'words').write_text(' '.join(sys.argv[2:]))"
     run_dir = tmp_path / "run"
     run_dir.mkdir()

@@ -55,7 +55,7 @@ def feed(weighting: Weighting, dots: list[dict[str, float]], losses: dict[str, f
 
 
 def test_weights_move_every_n_updates_by_the_mean() -> None:
-    """Seven updates with N = 5: one change of the weights, and two updates that wait for the next."""
+    """Ten updates with N = 5 change the weights twice, each time by the mean over the last five."""
     dots = [{"near": 0.1 * step, "far": -0.3 * step} for step in range(1, 11)]
     losses = {MAIN: 2.0, "near": 0.5, "far": 3.0}
     slopes = {"near": 1 / (2.0 + 1e-8) / 0.52, "far": 1 / (2.0 + 1e-8) / 3.02}
@@ -223,7 +223,7 @@ def test_finite_at_zero_and_negative_losses(case: str) -> None:
 
 @pytest.mark.parametrize("case", ["cosine", "ol_aux", "ol_aux window", "ol_aux_ablation"])
 def test_seeds_side_by_side_are_seeds_one_by_one(case: str) -> None:
-    """Three states in one vmap, inside a scan of a number of updates that N does not divide."""
+    """Three states are updated in one vmap, within a scan of a number of updates that N does not divide."""
     weighting = weighting_of(case)
     losses, compared = raw_gradients(0)
 

@@ -94,7 +94,7 @@ CASES = {
 
 @pytest.mark.parametrize("name", ALL)
 def test_every_number_is_finite(name: str) -> None:
-    """Three steps from each of the cases, and one from the first that follows them."""
+    """Three steps are taken from the initial state in each of the cases."""
     for case, (gradients, losses) in CASES.items():
         state = begin(name)
         by_name = {each: jnp.float32(loss) for each, loss in zip(NAMES, losses, strict=True)}
@@ -122,7 +122,7 @@ def test_losses_may_change_places(name: str) -> None:
 
 @pytest.mark.parametrize("name", ALL)
 def test_one_direction_that_all_gradients_share_is_kept(name: str) -> None:
-    """Equal gradients: the step is a positive multiple of them."""
+    """If all gradients are equal, the step is a positive multiple of them."""
     row = rows(1)[0]
     step, _ = take(name, np.repeat(row[None], 3, axis=0))
     cosine = step @ row / (np.linalg.norm(step) * np.linalg.norm(row))
@@ -157,7 +157,7 @@ def test_steps_scale_with_the_gradients_as_papers_say(name: str) -> None:
 
 @pytest.mark.parametrize("name", ("nash_mtl", "auxinash", "imtl_g", "db_mtl", "geometric_mean", "balance"))
 def test_units_of_the_losses_do_not_matter(name: str) -> None:
-    """Each loss and its gradient in another unit: the step keeps its direction."""
+    """If each loss and its gradient are in another unit, the step keeps its direction."""
     units = np.array([0.05, 1.0, 30.0]) if name != "balance" else np.array([50.0, 100.0, 3e3])  # far above eps
     base = np.array([1.0, 1.0, 1.0]) if name != "balance" else np.array([1e4, 1e4, 1e4])
     one, _ = take(name, rows(6) * base[:, None], tuple(base))

@@ -55,7 +55,7 @@ def test_projections_onto_the_cone_of_two_gradients_are_the_closed_form() -> Non
     assert one @ other < 0
 
     def project(vector: np.ndarray) -> np.ndarray:
-        """Onto the directions that oppose neither: at most one of the two constraints holds with equality here."""
+        """Project onto the directions that oppose neither: at most one of the two constraints holds with equality here."""
         for normal in (one, other):
             moved = vector - min(0.0, vector @ normal) * normal / (normal @ normal)
             if min(moved @ one, moved @ other) > -1e-9:
@@ -84,7 +84,7 @@ def test_cagrad_has_the_best_worst_loss_in_its_ball() -> None:
 
 
 def test_cagrad_of_gradients_on_a_line_stops_short_of_the_mean_or_goes_beyond_it() -> None:
-    """By c = 1/2: of mixed signs, whatever the step, some loss rises, the least for the shortest; of one sign, all fall."""
+    """With c = 1/2, the step is half the mean if signs are mixed (some loss must rise), and 1.5 times the mean if not."""
     signed = np.random.default_rng(3).normal(size=(200, 3))
     signed[0] = [1.0, -0.42374804, -0.60578518]  # one gradient is shifted to 0 on the way
     weighting = jw.cagrad(0.5)
@@ -126,7 +126,7 @@ def test_closed_forms() -> None:
 
 
 def test_dependent_gradients_have_solutions() -> None:
-    """Rank 1 and rank 2 of 3."""
+    """Three gradients span one or two dimensions."""
     for rank in (1, 2):
         random = np.random.default_rng(rank)
         rows = random.normal(size=(3, rank)) @ random.normal(size=(rank, 6))
@@ -388,7 +388,7 @@ def test_both_ways_find_the_explicit_gramian() -> None:
 
 
 def test_gramians_through_groups_of_latents_and_of_parts_of_a_batch() -> None:
-    """Losses that read different latents, on two devices: the Gramian of the mean losses."""
+    """Losses read different latents, and the batch is on two devices: the Gramian is that of the mean losses."""
     params, batch = problem(1, size=24)
     groups = {
         "first": lambda encoder, batch: encode(encoder, batch),

@@ -86,7 +86,7 @@ def test_heads_learn_while_their_loss_is_kept_out_of_the_encoder(case: str, mode
 
 
 def passes_through_the_encoder(mode: Any, losses: int) -> int:
-    """How often a step multiplies by the encoder's inputs: once a forward pass, a backward pass or a tangent."""
+    """Count a step's products with the encoder's inputs: one for each forward pass, backward pass or tangent."""
     params, batch = in_float32(problem(0))
     names = [MAIN, *(f"other{number}" for number in range(losses - 1))]
     params["heads"] = {name: params["heads"][MAIN] for name in names}
@@ -199,7 +199,7 @@ def test_dots_of_large_trees_are_exact_enough() -> None:
 
 
 def test_bfloat16() -> None:
-    """Of parameters in bfloat16: weights and gradients are float32, and point where those of float32 parameters do."""
+    """Weights and gradients of bfloat16 parameters are float32, and have the direction of those of float32 parameters."""
     params, batch = in_float32(problem(1, size=64))
     weighting = make_weighting("ol_aux", interval=1, learning_rate=0.01)
 

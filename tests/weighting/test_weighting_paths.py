@@ -28,14 +28,14 @@ def test_every_path_ends_on_the_front(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["mgda", "upgrad", "dualproj"])
 def test_no_loss_rises_but_by_the_length_of_a_step(name: str) -> None:
-    """Steps that oppose no gradient: a loss gains at most half its greatest curvature, 4 and 16, times the squared step."""
+    """Steps oppose no gradient, so that a loss gains at most half its greatest curvature, 4 or 16, times the squared step."""
     paths = pareto.descend(jw.make_weighting(name))
     squared = np.square(np.diff(paths.points, axis=1)).sum(axis=-1)
     assert (np.diff(paths.losses, axis=1) <= squared[..., None] * [2.0, 8.0] + 1e-5).all()
 
 
 def test_equal_lengths_of_projections_end_between_the_minima_and_sums_at_the_longer_gradients() -> None:
-    """On the front, gradients are opposed: GradNorm and Nash-MTL weigh them alike there, the sum follows the longer ones."""
+    """Gradients are opposed on the front: GradNorm and Nash-MTL weigh them alike there, the sum follows the longer ones."""
     ends = {name: pareto.descend(jw.make_weighting(name)).points[:, -1, 0] for name in ("sum", "mgda", "nash_mtl")}
     np.testing.assert_allclose(ends["sum"], 0.6, atol=0.02)  # of (x + 1) + 4 (x - 1)
     assert np.ptp(ends["mgda"]) > 0.5  # where each path meets the front first
