@@ -160,7 +160,7 @@ def test_allowed_values_are_written_once() -> None:
 
 
 def test_defaults_follow_the_method() -> None:
-    """The indicator has R+ = 1, R- = -1 (thesis, section 5.1.4), and a filter threshold in the middle of its band."""
+    """R+ = 1 and R- = -1 of the indicator are from the thesis, section 5.1.4; the filter's threshold is its band's middle."""
     resolved = {name: resolve(Config().replace(method=name), 50) for name in METHODS}
     discount = 1 - 1 / 50
     for name, (positive, balance) in {

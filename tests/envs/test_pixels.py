@@ -545,7 +545,7 @@ def test_images_of_wrapped_environments_equal_those_of_mujoco(name: str) -> None
 
 @pytest.mark.parametrize("name", make_pixels_references.MODELS)
 def test_normals_are_those_of_the_depths_of_mujoco(name: str) -> None:
-    """The surface goes through the points of MuJoCo's depth image; compared is where one object fills the neighbourhood."""
+    """The reference is the surface through MuJoCo's depths, where one object fills a pixel's neighbourhood."""
     model = make_pixels_references.MODELS[name]
     mj_model, references = model.load(), render_references.load(name)
     views = pixels.Views(mj_model, model.camera, references.rgb.shape[1:3], ("normals", "segmentation"))

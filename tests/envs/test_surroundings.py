@@ -82,7 +82,7 @@ def scene(depth: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_a_panel_is_where_it_projects():
-    """A board of 1 x 0.5 m, 2 m away, its foot level with the camera, covers 50 columns of the 25 rows above the middle."""
+    """A board of 1 x 0.5 m, 2 m away, its foot level with the camera, covers 50 columns and the 25 rows above the middle."""
     picture = np.concatenate([np.full((4, 4, 3), 0.4, np.float32), np.ones((4, 4, 1), np.float32)], axis=2)
     board = Panel(np.array([-0.5, 0.0, 1.0]), np.array([1.0, 0, 0]), np.array([0, 0, 0.5]), picture)
     radiance, instance, depth = render_panels(scene(5.0), [board], CAMERA, LIGHT)

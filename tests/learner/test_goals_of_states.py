@@ -15,7 +15,7 @@ ENVS, HORIZON = 2, 4
 
 
 def test_relabelled_goals_tell_of_the_box_alone():
-    """FetchPush's own rule; where a goal is met, the indicator is positive wherever the arm is."""
+    """FetchPush's own rule makes goals; where a goal is met, the indicator is positive wherever the arm is."""
     env = jaxrl_vis_envs.make("FetchPush")
     observations = np.random.default_rng(0).uniform(0.3, 0.6, (ENVS, HORIZON + 2, 25)).astype(np.float32)
     observations[0, 3, 3:6] = observations[0, 2, 3:6]  # the box rests for a step, the arm does not

@@ -215,7 +215,7 @@ def test_most_constraints_of_the_hand_tie_few_joints():
 
 
 def test_a_problem_of_the_hand_is_solved():
-    """24 joints: a tree's factorization, which contacts fill in.
+    """The hand has 24 joints: contacts fill in the factorization of a tree.
 
     NumPy does the arithmetic, in float32, too: to compile it takes minutes, and JAX takes ten seconds for it scalar by scalar.
     """
