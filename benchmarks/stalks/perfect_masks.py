@@ -29,7 +29,8 @@ def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]
     """
     sequence = Sequence.of(draw(family, seed))
     pair, drive = sequence[frame], sequence.drive
-    instance, left, right = np.asarray(pair.instance), to_grey_floats(np.asarray(pair.left)), to_grey_floats(np.asarray(pair.right))
+    instance = np.asarray(pair.instance)
+    left, right = to_grey_floats(np.asarray(pair.left)), to_grey_floats(np.asarray(pair.right))
     rows = []
     for view in stalks_in_view(sequence.plot, pair.pose, drive.true, instance, np.asarray(pair.depth)):
         if view.band_box is None or view.band_visible < 0.3:

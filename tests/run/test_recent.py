@@ -116,7 +116,8 @@ def test_another_runs_states_are_not_there(states, tmp_path):
     theirs.run_id, ours.run_id = "theirs", "ours"
     theirs.save(5, states[0][5], E, {})
     assert theirs.iterations() == [5] and ours.iterations() == []
-    assert not theirs.set_aside_foreign_runs(tmp_path / "foreign" / RECENT) and ours.set_aside_foreign_runs(tmp_path / "foreign" / RECENT)
+    aside = tmp_path / "foreign" / RECENT
+    assert not theirs.set_aside_foreign_runs(aside) and ours.set_aside_foreign_runs(aside)
     ours.save(1, states[0][1], E, {})
     assert ours.iterations() == [1] and theirs.iterations() == []
     store = Recent(tmp_path / "foreign" / RECENT, print)

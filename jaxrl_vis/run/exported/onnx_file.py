@@ -1,4 +1,4 @@
-"""Policies as ONNX: the graph is written node by node from `PolicyWeights`, and run by onnxruntime. Both are the extra ``export``."""
+"""Policies as ONNX: `PolicyWeights` are written node by node as a graph, run by onnxruntime. Both are the extra ``export``."""
 
 import importlib
 from pathlib import Path

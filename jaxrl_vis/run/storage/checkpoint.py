@@ -61,7 +61,8 @@ class Checkpoints:
         read_only: Whether to only read: nothing is saved, created or cleaned up.
 
     Attributes:
-        run_id: Id of the run: other runs' checkpoints are ignored, except by `set_aside_foreign_runs`. `ANY_RUN`: all checkpoints.
+        run_id: Id of the run: other runs' checkpoints are ignored, except by `set_aside_foreign_runs`. `ANY_RUN`: all
+            checkpoints.
         recent: Recent states of the run.
     """
 

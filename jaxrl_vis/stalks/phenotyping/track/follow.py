@@ -287,7 +287,8 @@ def _merge_tracks(tracks: list[_OpenTrack], gates: Gates) -> list[_OpenTrack]:
             shared = {frame for frame, _ in track.sightings} & {frame for frame, _ in other.sightings}
             # A wrongly assigned sighting may make both appear in one pair.
             near = aside < gates.merge and away < gates.depth
-            if (near or _one_behind(track, other) < gates.merge_across_depths) and len(shared) <= gates.max_shared * len(track.sightings):
+            one_stalk = near or _one_behind(track, other) < gates.merge_across_depths
+            if one_stalk and len(shared) <= gates.max_shared * len(track.sightings):
                 other.sightings += track.sightings
                 other.along += track.along
                 other.depth += track.depth
