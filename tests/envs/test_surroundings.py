@@ -67,10 +67,10 @@ def test_each_factor_shows_and_leaves_the_stalk_where_it_is(factor, minimum):
 
 def test_all_surroundings_share_one_trace():
     rendered()
-    before = drawing._program.cache_info().currsize
-    rendered(5, walls=(3, 3), structures=(3, 3), organs=(1, 1), indoors=1, robot=1, portrait=0)
-    assert drawing._program.cache_info().currsize == before
-    assert drawing._program(4, drawing.tile_size(WIDTH), 1, 1)._cache_size() == 1  # upright and level images, too
+    program = drawing._program(4, drawing.tile_size(WIDTH), 1, 1)
+    before = drawing._program.cache_info().currsize, program._cache_size()
+    rendered(5, walls=(3, 3), structures=(3, 3), organs=(1, 1), indoors=1, robot=1, portrait=0)  # level, not upright
+    assert (drawing._program.cache_info().currsize, program._cache_size()) == before
 
 
 CAMERA = (np.array([0.0, -2.0, 1.0]), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), 100.0, (50.0, 40.0))

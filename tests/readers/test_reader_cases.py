@@ -176,6 +176,13 @@ def test_annotations_that_cannot_be_used_are_told(tmp_path, annotation, image, t
         coco(tmp_path, annotation, **image)
 
 
+def test_an_annotation_without_an_image_id_is_told(tmp_path):
+    data = {"images": [{"id": 1, "file_name": "a.png", **SIZE}], "annotations": [{"id": 5, "bbox": [1, 2, 3, 4]}]}
+    (tmp_path / "annotations.json").write_text(json.dumps(data))
+    with pytest.raises(RequestError, match="annotation 5 has no image_id: mend it, or delete it"):
+        read_annotations(tmp_path)
+
+
 def test_annotations_that_are_not_there_or_cannot_be_read_are_told(tmp_path):
     for folder in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(RequestError, match="there are no annotations in "):

@@ -63,7 +63,8 @@ def read_annotations(folder: Path, labels: Sequence[str] = ()) -> dict[str, Any]
         source = str(image.source)
         images.append({"id": key, "file_name": image.name, "width": image.width, "height": image.height, "source": source})
         for annotation in image.annotations:
-            annotations.append({**annotation, "image_id": annotation["image_id"] if annotation.get("orphan") else key})
+            # Annotations of no image keep what they say, which the check names.
+            annotations.append({**annotation, "image_id": annotation.get("image_id") if annotation.get("orphan") else key})
     path = folder / "annotations.json" if (folder / "annotations.json").exists() else folder
     return _check_annotations({"images": images, "annotations": annotations}, path, labels)
 
@@ -143,6 +144,8 @@ def _check_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple[i
             the annotation's name.
     """
     number = annotation.get("image_id")
+    if number is None:
+        raise ValueError("has no image_id")
     if not isinstance(number, (int, str)) or number not in sizes:
         raise ValueError(f"has the image_id {reprlib.repr(number)}, which no image has")
     height, width = sizes[number]
