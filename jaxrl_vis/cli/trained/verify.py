@@ -33,14 +33,14 @@ def run(options: Verify) -> int:
     from jaxrl_vis.run.verifying.verification import verify_run
 
     report = verify_run(run_dir, options.iterations, cache_programs=True, echo=print, trust=trust)
-    for title, lines in (("not verified", report.unverified), ("note", report.notes), ("elsewhere", report.caveats)):
+    for title, lines in (("not verified", report.unverified), ("note", report.notes), ("caveat", report.caveats)):
         for line in lines:
             print(f"{title}: {line}")
     for line in report.problems:
         print(f"wrong: {line}")
     if report.differences and report.caveats:
         largest = "not a number" if math.isinf(report.largest) else f"{report.largest:.1e}"
-        print(f"numbers may differ on this machine, see elsewhere; the largest relative difference: {largest}")
+        print(f"numbers may differ on this machine, see the caveats; the largest relative difference: {largest}")
     if report.problems:
         print(f"verification failed: see what is wrong above; {report.rows} rows were repeated")
         return 1
