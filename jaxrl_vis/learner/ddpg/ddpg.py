@@ -248,23 +248,23 @@ def make_ddpg(
         assert batch.reward is not None
         state = auxiliary.start(copies.actor if of_states else copies.critic) if agent.weighting is None else agent.weighting
         compute = network_gradients.critic_of_states if of_states else network_gradients.critic_of_images
-        found = compute(learning, copies, prepared._replace(batch=batch), state, with_actor)
-        metrics, mean_square = found.metrics, None if found.action is None else jnp.mean(jnp.square(found.action))
+        computed = compute(learning, copies, prepared._replace(batch=batch), state, with_actor)
+        metrics, mean_square = computed.metrics, None if computed.action is None else jnp.mean(jnp.square(computed.action))
         counts = diagnostics.count_rewards(
-            batch.reward, found.keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
+            batch.reward, computed.keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
         )
         if learned_reward is not None and rewarded is not None:
             metrics[f"train/{learned_reward.name}_loss"] = rewarded.loss
         of_model = rewarded.gradient if rewarded is not None else None
         # Average everything that was not reduced earlier over the shards of a learner, in one all-reduce.
-        own = {"critic": found.critic, "actor": found.actor}
+        own = {"critic": computed.critic, "actor": computed.actor}
         reduced = own.pop("actor" if of_states else "critic") if learning.reduces_early else None
         own, of_model, metrics, mean_square, counts = shards.mean((own, of_model, metrics, mean_square, counts))
         if mean_square is not None:
             metrics["train/action_size"] = jnp.sqrt(mean_square)
         metrics |= {f"train/{name}": fraction for name, fraction in diagnostics.fractions(counts, shards.count).items()}
         critic, actor = own.get("critic", reduced), own.get("actor", reduced)
-        return Gradients(critic, actor, found.weighting if keeps_state else None, of_model), metrics
+        return Gradients(critic, actor, computed.weighting if keeps_state else None, of_model), metrics
 
     def apply(working: WorkingState, chosen: Gradients) -> WorkingState:
         counts = working.counts + jnp.array([1, int(chosen.actor is not None), 1])

@@ -179,7 +179,6 @@ class Objectives:
         networks = self.networks
 
         def critic_losses(critic: Params, encoded: Latents | dict[str, jax.Array]):
-            assert batch.reward is not None
             latents = _collect_latents(self.auxiliary, encoded)
             of_actor, of_critic = _next_latents(networks, copies, inputs, jax.lax.stop_gradient(latents))
             target = self._target(copies, of_actor, of_critic, batch, noise)

@@ -105,8 +105,8 @@ def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> blocks.Nearest
     """
     scene, unit = jax.lax.stop_gradient((scene, unit))
     key, row = blocks.nearest_primitives(scene, unit, rays)
-    found = nearest_triangle(scene, unit, raycast.decode(scene, key, row)[0], blocks.layout(scene))
-    return blocks.add_triangles(scene, key, row, found)
+    first_triangle = nearest_triangle(scene, unit, raycast.decode(scene, key, row)[0], blocks.layout(scene))
+    return blocks.add_triangles(scene, key, row, first_triangle)
 
 
 def nearest_triangle(

@@ -73,7 +73,7 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         )
         if settings.section:
             shape = example.image.shape[:2]
-            masks = [_annotated_mask(each, size) if each["segmentation"] else None for each in annotations]
+            masks = [_annotated_mask(one, size) if one["segmentation"] else None for one in annotations]
             masks += [None] * len(strips)
             edges = annotated_edges(stalks, kinds, masks, shape, (size[0] / shape[0], size[1] / shape[1]))
             example = dataclasses.replace(example, edges=edges)
@@ -155,7 +155,7 @@ def fit_settings(folder: Path, settings: Settings, labels: tuple[str, ...] = ())
         width = settings.band_height / tall
         if settings.section:
             heights = {image["id"]: image["height"] for image in data["images"]}
-            wide = [_stalk_width(each, heights[each["image_id"]], widths[each["image_id"]]) for each in boxes]
+            wide = [_stalk_width(box, heights[box["image_id"]], widths[box["image_id"]]) for box in boxes]
             width = _STALK_WIDTH / float(np.median(wide))
         width = round(min(width, _MAX_WIDTH, _MAX_ENLARGED * max(widths.values())))
         ratio = settings.full_width / settings.width

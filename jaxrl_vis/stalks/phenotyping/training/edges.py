@@ -42,14 +42,14 @@ def synthetic_edges(
     count, total = -(-shape[0] // STEP), len(plot.stalks)
     bins = np.minimum(((np.arange(thinned.shape[0]) * thin + 0.5) / scale[0] / STEP).astype(int), count - 1)
     of_stalks = bins[:, None] * total + thinned
-    seen = np.bincount(of_stalks[thinned >= 0], minlength=count * total).reshape(count, total)  # pixels
+    counts = np.bincount(of_stalks[thinned >= 0], minlength=count * total).reshape(count, total)  # of pixels
     sampled = np.bincount(bins, minlength=count)  # rows
     lines = (np.arange(count) + 0.5) * STEP * scale[0] - 0.5
     pixel = thin * thin / (scale[0] * scale[1])  # of the resized image
     by_day = plot.family.scene.share > 0
-    found: list[tuple[float, np.ndarray, int]] = []
-    for number in np.flatnonzero(seen.any(axis=0)).tolist():
-        amount = int(seen[:, number].sum())
+    candidates: list[tuple[float, np.ndarray, int]] = []
+    for number in np.flatnonzero(counts.any(axis=0)).tolist():
+        amount = int(counts[:, number].sum())
         row = plot.stalks[number].row
         if row < 0 or (row > 0 and not by_day) or amount * pixel < _FEW:
             continue
@@ -58,14 +58,14 @@ def synthetic_edges(
             continue
         left, right, there = sides
         room = sampled * np.maximum(right - left, 1.0) / thin
-        visible = np.where(there, np.minimum(seen[:, number] / np.maximum(room, 1e-6), 1.0), ABSENT)
+        visible = np.where(there, np.minimum(counts[:, number] / np.maximum(room, 1e-6), 1.0), ABSENT)
         columns = np.stack([(left + 0.5) / scale[1], (right + 0.5) / scale[1], visible], axis=-1).astype(np.float32)
         kind = STALK if row == 0 else UNCLEAR
-        found.append((amount * (1.0 if kind == STALK else 1e-6), columns, kind))
-    found.sort(key=lambda each: -each[0])
-    found = found[:MAX_EDGES]
-    edges = np.array([columns for _, columns, _ in found], np.float32).reshape(-1, count, 3)
-    return edges, np.array([kind for _, _, kind in found], np.int32)
+        candidates.append((amount * (1.0 if kind == STALK else 1e-6), columns, kind))
+    candidates.sort(key=lambda candidate: -candidate[0])
+    candidates = candidates[:MAX_EDGES]
+    edges = np.array([columns for _, columns, _ in candidates], np.float32).reshape(-1, count, 3)
+    return edges, np.array([kind for _, _, kind in candidates], np.int32)
 
 
 def _sides(
@@ -104,10 +104,10 @@ def _interpolate(lines: np.ndarray, at: np.ndarray, values: np.ndarray) -> np.nd
 def boxes_around_edges(edges: np.ndarray) -> np.ndarray:
     """Return the boxes [T, 4] float32 around the visible rows of edges [T, R, 3]; (0, 0, 0, 0) for stalks without such rows."""
     boxes = np.zeros((len(edges), 4), np.float32)
-    for box, each in zip(boxes, edges):
-        rows = np.flatnonzero(each[:, 2] > UNKNOWN)
+    for box, columns in zip(boxes, edges):
+        rows = np.flatnonzero(columns[:, 2] > UNKNOWN)
         if len(rows):
-            box[:] = each[rows, 0].min(), rows[0] * STEP, each[rows, 1].max(), (rows[-1] + 1) * STEP
+            box[:] = columns[rows, 0].min(), rows[0] * STEP, columns[rows, 1].max(), (rows[-1] + 1) * STEP
     return boxes
 
 
@@ -126,10 +126,10 @@ def stack_edges(edges: Sequence[Edges | None], height: int) -> Edges:
     rows = -(-height // STEP)
     batch, kinds = np.zeros((len(edges), MAX_EDGES, rows, 3), np.float32), np.full((len(edges), MAX_EDGES), NOTHING, np.int32)
     batch[..., 2] = ABSENT
-    for part, kind, each in zip(batch, kinds, edges):
-        if each is not None:
-            count = min(each[0].shape[1], rows)
-            part[: len(each[0]), :count], kind[: len(each[1])] = each[0][:, :count], each[1]
+    for part, kind, of_image in zip(batch, kinds, edges):
+        if of_image is not None:
+            count = min(of_image[0].shape[1], rows)
+            part[: len(of_image[0]), :count], kind[: len(of_image[1])] = of_image[0][:, :count], of_image[1]
             # The last band may be padded: edges go on straight there, so that its sections have the right slope.
             more = np.arange(1, rows - count + 1)[:, None]
             last = part[:, max(count - 1, 0), None, :2]
