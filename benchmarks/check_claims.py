@@ -1,10 +1,10 @@
-"""Recompute every published figure derived from learning records, and list those that differ.
+"""Recompute every published figure derived from learning records or audits, and list those that differ.
 
 python benchmarks/check_claims.py    # exit 1 if anything differs
 
-Covers the tables of docs/lab/results.md, docs/lab/target_decay.md and docs/lab/ablations.md, all tables of
-`benchmarks.claims.pages`, and the numbers in sentences of README.md, docs/index.md and the pages of the studies
-(`benchmarks.claims.sentences`).
+Covers the tables of docs/lab/results.md, docs/lab/target_decay.md and docs/lab/ablations.md, the audit of rewards in
+docs/indicator_rewards.md, all tables of `benchmarks.claims.pages`, and the numbers in sentences of README.md, docs/index.md and
+the pages of the studies (`benchmarks.claims.sentences`).
 """
 
 import sys
@@ -18,8 +18,9 @@ OF_LEARNING = {
     "docs/lab/results.md": "results table",
     "docs/lab/target_decay.md": "tables",
     "docs/lab/ablations.md": "curves",
+    "docs/indicator_rewards.md": "audit",
 }
-"""Tables of the ledger derived from learning records: page -> name in its markers."""
+"""Tables of the ledger derived from learning records or audits: page -> name in its markers."""
 
 
 def ledger_differences() -> Iterator[str]:

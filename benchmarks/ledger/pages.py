@@ -9,6 +9,7 @@ from benchmarks.ledger import ablations
 from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
 from benchmarks.ledger.tables import (
+    audit,
     comparison,
     contrastive,
     exported,
@@ -56,7 +57,7 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/phenotyping.md": {"lenses": stalks.lens_table, "coverage": stalks.coverage_table},
     "docs/export.md": {"policies": exported.exported_table},
     "docs/algorithms.md": {"forms": contrastive.forms_table},
-    "docs/indicator_rewards.md": {"host": host.host_table},
+    "docs/indicator_rewards.md": {"host": host.host_table, "audit": audit.audit_table},
     "docs/pixels.md": {"tasks": pixels.tasks_table, "training": pixels.training_table},
     "docs/tasks.md": {"push on a GPU": push.gpu_table, "push on a CPU": push.cpu_table},
     "docs/where_it_ran.md": {"platforms": platforms.platforms_table, "not run": platforms.not_run_table},

@@ -1,0 +1,53 @@
+"""Table of docs/indicator_rewards.md: rewards compared with the true ones, from the records of `jaxrl-vis audit --json`."""
+
+import textwrap
+from pathlib import Path
+from typing import Any
+
+from benchmarks.claims.markdown import origin_sentence
+from benchmarks.claims.records import Record
+from benchmarks.ledger.markers import WIDTH
+from jaxrl_vis.bench.record import read_json
+from jaxrl_vis.studies.audit.report import COLUMNS
+from jaxrl_vis.studies.audit.rewards import BUILT_IN
+
+FOLDER = "audit"
+
+
+def audit_table(results: Path) -> str | None:
+    """Return a table with a row for each task and reward as Markdown; None without records."""
+    files = sorted((results / FOLDER).glob("*.json"))
+    return rows([read_json(file) for file in files]) if files else None
+
+
+def rows(records: list[dict[str, Any]]) -> str:
+    """Return a table of the records of several audits as Markdown, followed by their settings and origins."""
+    lines = ["| " + " | ".join(["task", "reward", *COLUMNS.values()]) + " |", "|" + "---|" * (len(COLUMNS) + 2)]
+    for record in records:
+        task = _task(record["audit"])
+        for name, figures in record["rewards"].items():
+            cells = [task, _reward(name), *(f"{figures[key]:.3f}" for key in COLUMNS)]
+            lines.append("|" + "".join(f" {cell} |" if cell else " |" for cell in cells))
+            task = ""
+    settings = dict.fromkeys(_settings(record["audit"]) for record in records)
+    origins = frozenset(f"{(record['revision'] or 'unknown')[:7]} on {record['device']}" for record in records)
+    made = origin_sentence([Record(FOLDER, (), origins)])
+    return "\n".join([*lines, "", textwrap.fill(f"{'; '.join(settings)}. {' '.join(made.split())}", WIDTH)])
+
+
+def _task(options: dict[str, Any]) -> str:
+    """Return a task with its images and camera noise, which can differ from row to row, as text."""
+    size, noise = options["image_size"], options["noise"]
+    return f"{options['env']}, {size}x{size} {options['pixels']}" + (f", noise {noise:g}" if noise else "")
+
+
+def _reward(name: str) -> str:
+    """Return the name of a reward in the table; a run folder is named after the model that was trained in it."""
+    return f"`{name}`" if name in BUILT_IN or ":" in name else f"{Path(name).name}, trained"
+
+
+def _settings(options: dict[str, Any]) -> str:
+    return (
+        f"{options['episodes']} episodes, {options['goals']} goals with {options['sequences']} action sequences each; tolerance "
+        f"{options['tolerance']:g} for a fraction of {options['tolerance_share']:g}"
+    )
