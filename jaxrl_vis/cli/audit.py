@@ -9,7 +9,7 @@ from jaxrl_vis.cli.task_images import TaskImages
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.host.files import write_atomically
-from jaxrl_vis.host.provenance import revision
+from jaxrl_vis.host.provenance import device_name, revision
 from jaxrl_vis.report.outputs import check_figure, check_writable
 
 
@@ -71,12 +71,17 @@ def run(options: Audit) -> int:
     counts = {"episodes": options.episodes, "goals": options.goals, "sequences": options.sequences}
     records, pairs, values = report.audit(env, rewards, **counts, noise=options.noise, seed=options.seed)
     print(report.table(records))
+    reached = int((pairs.distance <= env.threshold).sum())
+    print(
+        f"\n{len(pairs.distance):,} pairs of an image and a goal, of which {reached:,} truly reach it (distance up to "
+        f"{env.threshold:g} {env.distance_unit}); {options.goals} goals, {options.sequences} action sequences each"
+    )
     if options.out is not None:
         report.draw(pairs, values, env.threshold, env.distance_unit, options.out)
         print(options.out)
     if options.json is not None:
         asked = {key: value for key, value in dataclasses.asdict(options).items() if key not in ("out", "json", "trust")}
-        origin = {"revision": revision(), "device": report.device_kind()}
-        record = {"audit": asked, **origin, "pairs": len(pairs.distance), "rewards": records}
+        origin = {"revision": revision(), "device": device_name()}
+        record = {"audit": asked, **origin, "pairs": len(pairs.distance), "reached_pairs": reached, "rewards": records}
         write_atomically(options.json, json.dumps(record, indent=2) + "\n")
     return 0

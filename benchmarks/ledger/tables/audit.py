@@ -29,10 +29,9 @@ def rows(records: list[dict[str, Any]]) -> str:
             cells = [task, _reward(name), *(f"{figures[key]:.3f}" for key in COLUMNS)]
             lines.append("|" + "".join(f" {cell} |" if cell else " |" for cell in cells))
             task = ""
-    settings = dict.fromkeys(_settings(record["audit"]) for record in records)
     origins = frozenset(f"{(record['revision'] or 'unknown')[:7]} on {record['device']}" for record in records)
-    made = origin_sentence([Record(FOLDER, (), origins)])
-    return "\n".join([*lines, "", textwrap.fill(f"{'; '.join(settings)}. {' '.join(made.split())}", WIDTH)])
+    made = " ".join(origin_sentence([Record(FOLDER, (), origins)]).split())
+    return "\n".join([*lines, "", textwrap.fill(f"{_settings([record['audit'] for record in records])}. {made}", WIDTH)])
 
 
 def _task(options: dict[str, Any]) -> str:
@@ -46,8 +45,13 @@ def _reward(name: str) -> str:
     return f"`{name}`" if name in BUILT_IN or ":" in name else f"{Path(name).name}, trained"
 
 
-def _settings(options: dict[str, Any]) -> str:
-    return (
-        f"{options['episodes']} episodes, {options['goals']} goals with {options['sequences']} action sequences each; tolerance "
-        f"{options['tolerance']:g} for a fraction of {options['tolerance_share']:g}"
-    )
+def _settings(audits: list[dict[str, Any]]) -> str:
+    """Return the settings of audits as text, with the tasks of each if they differ."""
+    tasks: dict[str, list[str]] = {}
+    for options in audits:
+        counts = f"{options['episodes']} episodes, {options['goals']} goals with {options['sequences']} action sequences each"
+        text = f"{counts}; tolerance {options['tolerance']:g} for a fraction of {options['tolerance_share']:g}"
+        tasks.setdefault(text, []).append(options["env"])
+    if len(tasks) == 1:
+        return next(iter(tasks))
+    return ". ".join(f"{', '.join(names)}: {text}" for text, names in tasks.items())

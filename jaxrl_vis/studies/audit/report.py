@@ -1,12 +1,14 @@
 """Audit of several rewards on one task: a record for each, shown as a table and a figure."""
 
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 import jaxrl_vis_envs
 from jaxrl_vis.errors import RequestError
@@ -28,6 +30,7 @@ COLUMNS = {
 }
 """Keys of a record, and their headings; docs/indicator_rewards.md explains them."""
 _BATCH = 512
+_REWARD, _FREQUENCY = "#0f7b6c", "#b4531f"
 
 
 def _with_errors_named(name: str, reward: Reward) -> Reward:
@@ -117,14 +120,17 @@ def audit(
 
 
 def table(records: Mapping[str, Mapping[str, float]]) -> str:
-    """Format records as a Markdown table."""
-    rows = [["reward", *COLUMNS.values()], ["---"] * (len(COLUMNS) + 1)]
+    """Format records as a Markdown table with aligned columns."""
+    rows = [["reward", *COLUMNS.values()]]
     rows += [[name, *(f"{record[key]:.3f}" for key in COLUMNS)] for name, record in records.items()]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    rows.insert(1, ["-" * width for width in widths])
+    padded = ([cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows)
+    return "\n".join(f"| {' | '.join(row)} |" for row in padded)
 
 
 def draw(pairs: Pairs, values: Mapping[str, np.ndarray], threshold: float, unit: str, out: Path) -> None:
-    """Write a figure of rewards against true distances (quartiles in bins of the distance) and of their calibration.
+    """Write a figure with a column for each reward: rewards against true distances above, calibration below.
 
     Args:
         pairs: Pairs of images and goals.
@@ -133,36 +139,50 @@ def draw(pairs: Pairs, values: Mapping[str, np.ndarray], threshold: float, unit:
         unit: Unit of the distances.
         out: File of the figure; its suffix determines the format.
     """
-    names: Sequence[Any] = list(values)
-    figure = Figure(figsize=(3.1 * max(2, len(names)), 5.6), layout="constrained")
-    axes = figure.subplots(2, max(2, len(names)), squeeze=False)
-    edges = np.quantile(pairs.distance, np.linspace(0.0, 1.0, 21))
-    place = np.clip(np.searchsorted(edges, pairs.distance, side="right") - 1, 0, 19)
     is_reached = pairs.distance <= threshold
-    for column, name in enumerate(names):
-        above, below, reward = axes[0, column], axes[1, column], values[name]
-        some = [number for number in range(20) if np.any(place == number)]
-        middle = [np.mean(pairs.distance[place == number]) for number in some]
-        low, median, high = np.array([np.quantile(reward[place == number], [0.25, 0.5, 0.75]) for number in some]).T
-        above.fill_between(middle, low, high, color="#0f7b6c", alpha=0.2, linewidth=0)
-        above.plot(middle, median, color="#0f7b6c")
-        above.axvline(threshold, color=FAINT, linewidth=0.8)
-        above.set_title(name, color=INK, fontsize=10)
-        above.set_xlabel(f"true distance, {unit}")
-        mean, frequency, _ = measures.calibration(reward, is_reached)
-        below.plot([0, 1], [0, 1], color=FAINT, linewidth=0.8)
-        below.plot(mean, frequency, "o", color="#b4531f", markersize=4)
-        below.set_xlabel("reward")
-        for panel, label in ((above, "reward"), (below, "share that reaches")):
-            panel.set_ylim(-0.05, 1.05)
-            if column == 0:
-                panel.set_ylabel(label)
-    for column in range(len(names), axes.shape[1]):
-        for row in axes:
-            row[column].set_axis_off()
+    figure = Figure(figsize=(3.4 * len(values), 6.2), layout="constrained")
+    axes = figure.subplots(2, len(values), squeeze=False, sharey=True)
+    for (above, below), (name, reward) in zip(axes.T, values.items(), strict=True):
+        above.set_title("\n".join(textwrap.wrap(name, 34)), color=INK, fontsize=10)
+        _draw_distances(above, pairs.distance, reward, threshold, unit)
+        below.set_title(f"calibration error {measures.calibration_error(reward, is_reached):.3f}", color=INK, fontsize=9)
+        _draw_calibration(below, reward, is_reached)
+    for panel, label in ((axes[0, 0], "reward"), (axes[1, 0], "fraction that truly reaches")):
+        panel.set_ylim(-0.05, 1.05)
+        panel.set_ylabel(label)
+        panel.legend(fontsize=7, labelcolor=INK)
     figure.savefig(out, dpi=120)
 
 
-def device_kind() -> str:
-    """Return the kind of device on which audits run, for records."""
-    return jax.devices()[0].device_kind
+def _draw_distances(axes: Axes, distance: np.ndarray, reward: np.ndarray, threshold: float, unit: str) -> None:
+    """Draw mean and quartiles of rewards [N] against distances [N].
+
+    Pairs at distance zero, those up to the threshold and those beyond have separate bins: few pairs reach their goal, and would
+    share their bins with pairs that miss. For the same reason the axis is linear up to the threshold, and logarithmic beyond.
+    """
+    is_reached = distance <= threshold
+    bins = []
+    for rows, count in ((distance == 0.0, 1), (is_reached & (distance > 0.0), 5), (~is_reached, 15)):
+        order = np.flatnonzero(rows)[np.argsort(distance[rows])]
+        bins += [part for part in np.array_split(order, count) if part.size]
+    middle = [np.mean(distance[part]) for part in bins]
+    low, high = np.array([np.quantile(reward[part], [0.25, 0.75]) for part in bins]).T
+    axes.axvline(threshold, color=FAINT, linewidth=0.8, linestyle="--", label=f"threshold, {threshold:g} {unit}")
+    axes.fill_between(middle, low, high, color=_REWARD, alpha=0.2, linewidth=0, label="middle half of pairs")
+    axes.plot(middle, [np.mean(reward[part]) for part in bins], "o-", color=_REWARD, markersize=3, label="mean")
+    axes.set_xscale("symlog", linthresh=threshold)
+    steps = np.outer(10.0 ** np.arange(-6, 7), [1, 2, 5]).ravel()
+    axes.set_xticks([0.0, *steps[(steps >= threshold) & (steps <= distance.max())]])
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlim(left=-0.1 * threshold)
+    axes.set_xlabel(f"true distance, {unit}")
+
+
+def _draw_calibration(axes: Axes, reward: np.ndarray, is_reached: np.ndarray) -> None:
+    """Draw the fraction of reached pairs against the mean reward; the area of a bin's dot grows with its number of pairs."""
+    mean, frequency, count = measures.calibration(reward, is_reached)
+    axes.plot([0, 1], [0, 1], color=FAINT, linewidth=0.8, label="calibrated")
+    label = f"bin of pairs; the largest has {np.max(count):,}"
+    axes.scatter(mean, frequency, 8 + 92 * count / np.max(count), color=_FREQUENCY, linewidths=0, label=label)
+    axes.set_xlabel("reward")
