@@ -8,8 +8,10 @@ import numpy as np
 import point_mass
 import probe_environments as probes
 import pytest
+from matplotlib.figure import Figure
 from scipy import stats
 
+from benchmarks.ledger.tables import audit as published
 from jaxrl_vis import cli
 from jaxrl_vis.config import preset
 from jaxrl_vis.run.storage.folder import RunFolder
@@ -58,6 +60,16 @@ def test_a_probability_is_calibrated_and_its_square_is_not() -> None:
     assert measures.calibration_error(probability**2, is_reached) == pytest.approx(1 / 6, abs=0.01)  # mean of p - p^2
 
 
+def test_few_pairs_that_reach_have_bins_of_their_own_in_the_figure() -> None:
+    distance, axes = np.array([0.0, 0.05, *np.linspace(0.2, 0.9, 300)]), Figure().subplots()
+    reward = np.where(distance <= 0.1, 1.0 - distance, 0.0)
+    report._draw_distances(axes, distance, reward, threshold=0.1, unit="m")
+    _, line = axes.lines
+    places, means = line.get_data()
+    assert list(zip(places[:2], means[:2], strict=True)) == [(0.0, 1.0), (0.05, 0.95)]
+    assert len(means) == 17 and not np.any(means[2:])
+
+
 @pytest.fixture
 def point(here: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (here / "own.py").write_text(OWN)
@@ -83,8 +95,13 @@ def test_an_audit_tells_what_rewards_are_worth(point: Path, capsys: pytest.Captu
     assert exact["order_time"] > 0.5  # the last image is the goal
     assert {row["solvable"] for row in record["rewards"].values()} == {exact["solvable"]}
     assert Path("a.png").stat().st_size > 5000
-    table = capsys.readouterr().out
-    assert table.splitlines()[0] == "| reward | " + " | ".join(report.COLUMNS.values()) + " |"
+    head, line, *printed = capsys.readouterr().out.splitlines()
+    assert [cell.strip() for cell in head.split("|")[1:-1]] == ["reward", *report.COLUMNS.values()]
+    assert {len(row) for row in (line, *printed[:3])} == {len(head)} and printed[3] == ""
+    assert printed[4].startswith(f"120 pairs of an image and a goal, of which {record['reached_pairs']} truly reach it")
+    own_goals = 8  # each episode's last image is its own goal
+    assert own_goals <= record["reached_pairs"] < 120
+    assert f"| `indicator` | 0.000 | {exact['false_negative']:.3f} |" in published.rows([record])
 
 
 def test_noise_breaks_equality(point: Path) -> None:

@@ -175,6 +175,7 @@ def _draw_distances(axes: Axes, distance: np.ndarray, reward: np.ndarray, thresh
     axes.set_xticks([0.0, *steps[(steps >= threshold) & (steps <= distance.max())]])
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_locator(NullLocator())
+    axes.tick_params(axis="x", labelsize=8)
     axes.set_xlim(left=-0.1 * threshold)
     axes.set_xlabel(f"true distance, {unit}")
 
@@ -184,5 +185,5 @@ def _draw_calibration(axes: Axes, reward: np.ndarray, is_reached: np.ndarray) ->
     mean, frequency, count = measures.calibration(reward, is_reached)
     axes.plot([0, 1], [0, 1], color=FAINT, linewidth=0.8, label="calibrated")
     label = f"bin of pairs; the largest has {np.max(count):,}"
-    axes.scatter(mean, frequency, 8 + 92 * count / np.max(count), color=_FREQUENCY, linewidths=0, label=label)
+    axes.scatter(mean, frequency, 14 + 86 * count / np.max(count), color=_FREQUENCY, linewidths=0, label=label)
     axes.set_xlabel("reward")
