@@ -19,6 +19,7 @@ from jaxrl_vis_envs.names import nearest
 
 GROUP = "jaxrl_vis.environments"
 """Entry point group for the tasks of installed packages."""
+_MAX_MESSAGE = 400  # characters of a user's error; JAX's errors in traced code repeat themselves for pages
 
 
 class TaskModuleError(ValueError):
@@ -121,7 +122,10 @@ def describe_error(error: BaseException, file: str | None) -> str:
         return f"{type(error).__name__}: {error.msg} ({Path(error.filename or '?').name}, line {error.lineno})"
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
     where = f" ({Path(file).name}, line {lines[-1]})" if file and lines else ""
-    return f"{type(error).__name__}: {' '.join(str(error).split()) or 'no message'}{where}"
+    message = " ".join(str(error).split()) or "no message"
+    if len(message) > _MAX_MESSAGE:
+        message = message[:_MAX_MESSAGE].rstrip() + " ..."
+    return f"{type(error).__name__}: {message}{where}"
 
 
 def _import(module: str, source: Path | None, file: Path | None, folder: str | None) -> None:

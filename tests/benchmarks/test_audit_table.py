@@ -54,9 +54,8 @@ def test_each_reward_of_each_task_has_a_row_and_its_origin(tmp_path: Path) -> No
     ]
     assert far[0].startswith("| VisualFar, 100x100 rgbd, noise 5 |") and far[1].startswith("| | autoencoder")
     text = " ".join(table.split())
-    assert text.endswith(
-        "32 goals with 128 action sequences each; tolerance 8 for a fraction of 0.99. Made by abcdef0 on A GPU."
-    )
+    settings = "32 goals with 128 action sequences each; `indicator_tolerance` tolerates 8 grey levels in 0.99 of the elements."
+    assert text.endswith(f"{settings} Made by abcdef0 on A GPU.")
 
 
 def test_audits_with_other_settings_or_without_a_revision_are_told_apart() -> None:

@@ -33,6 +33,15 @@ def two_numbers(images, goals):
 
 def broken(images):
     return 1.0
+
+def one_for_all(images, goals):
+    return (images == goals).mean()
+
+def two_results(images, goals):
+    return always(images, goals), 1.0
+
+def not_traceable(images, goals):
+    return jnp.ones(len(images)) if (images == goals).all() else jnp.zeros(len(images))
 """
 
 
@@ -126,7 +135,7 @@ def test_a_model_that_a_run_has_trained_along_is_audited(point: Path, capsys: py
     capsys.readouterr()
     for words, message in (
         (["--rewards", "other"], "the run in other has no model of rewards: train with --method autoencoder or classifier"),
-        (["--rewards", "model", "--pixels", "rgb"], "sees images of (1, 8, 8), and these are of (3, 16, 16)"),
+        (["--rewards", "model", "--pixels", "rgb"], "sees images of (1, 8, 8), and these are of (3, 16, 16): give --pixels"),
     ):
         assert cli.main([*SMALL, *words]) == 2
         assert message in capsys.readouterr().err
@@ -136,8 +145,6 @@ def test_a_model_that_a_run_has_trained_along_is_audited(point: Path, capsys: py
     ("words", "message"),
     [
         (["--rewards", "own:too_large"], "reward own:too_large lies between 2 and 2: it must lie between 0 and 1"),
-        (["--rewards", "own:two_numbers"], "reward own:two_numbers has the shape (2,) for each image"),
-        (["--rewards", "own:broken"], "reward own:broken cannot be computed: TypeError"),
         (["--rewards", "own:none"], "own has no none"),
         (
             ["--rewards", "indicater"],
@@ -151,3 +158,23 @@ def test_a_model_that_a_run_has_trained_along_is_audited(point: Path, capsys: py
 def test_mistakes_get_one_line(point: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*SMALL, *words]) == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        ("two_numbers", "returns (512, 2) for 512 images: it must return (512,), one number for each"),
+        ("one_for_all", "returns () for 512 images"),
+        ("two_results", "returns (512,), () for 512 images"),
+        ("broken", "cannot be computed: TypeError"),
+        ("not_traceable", "cannot be computed: TracerBoolConversionError"),
+    ],
+)
+def test_a_reward_that_cannot_be_used_is_refused_before_any_episode(
+    point: Path, reward: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delattr(report, "play")
+    assert cli.main([*SMALL, "--rewards", "indicator", f"own:{reward}"]) == 2
+    line = capsys.readouterr().err
+    assert f"reward own:{reward} {message}" in line
+    assert line.count("\n") == 1 and len(line) < 600

@@ -50,7 +50,8 @@ def _settings(audits: list[dict[str, Any]]) -> str:
     tasks: dict[str, list[str]] = {}
     for options in audits:
         counts = f"{options['episodes']} episodes, {options['goals']} goals with {options['sequences']} action sequences each"
-        text = f"{counts}; tolerance {options['tolerance']:g} for a fraction of {options['tolerance_share']:g}"
+        tolerance = f"{options['tolerance']:g} grey levels in {options['tolerance_share']:g} of the elements"
+        text = f"{counts}; `indicator_tolerance` tolerates {tolerance}"
         tasks.setdefault(text, []).append(options["env"])
     if len(tasks) == 1:
         return next(iter(tasks))

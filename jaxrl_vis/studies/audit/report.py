@@ -48,18 +48,31 @@ def _with_errors_named(name: str, reward: Reward) -> Reward:
     return call
 
 
+def _check(name: str, reward: Reward, shape: tuple[int, ...]) -> None:
+    """Check, without computing anything, that a reward can be computed from images of ``shape``, as one number for each.
+
+    Raises:
+        RequestError: It cannot.
+    """
+    images = jax.ShapeDtypeStruct((_BATCH, *shape), np.uint8)
+    rewards = jax.eval_shape(_with_errors_named(name, reward), images, images)
+    if not isinstance(rewards, jax.ShapeDtypeStruct) or rewards.shape != (_BATCH,):
+        returned = ", ".join(str(leaf.shape) for leaf in jax.tree.leaves(rewards)) or "nothing"
+        raise RequestError(
+            f"reward {name} returns {returned} for {_BATCH} images: it must return ({_BATCH},), one number for each"
+        )
+
+
 def _rewards(name: str, reward: Reward, images: np.ndarray, goals: np.ndarray) -> np.ndarray:
     """Compute the rewards [N] of pairs in batches.
 
     Raises:
-        RequestError: The rewards are not one number between 0 and 1 for each pair.
+        RequestError: The rewards do not lie between 0 and 1.
     """
     compiled, rows = jaxrl_vis_envs.jit(_with_errors_named(name, reward)), []
     for first in range(0, len(images), _BATCH):
         indices = np.arange(first, first + _BATCH) % len(images)  # the last batch wraps around, so that all have the same size
         rows.append(np.asarray(compiled(images[indices], goals[indices]))[: len(images) - first])
-        if rows[-1].shape != (min(_BATCH, len(images) - first),):
-            raise RequestError(f"reward {name} has the shape {rows[-1].shape[1:]} for each image: it must be one number")
     values = np.concatenate(rows).astype(np.float64)
     if not np.all((values >= 0.0) & (values <= 1.0)):
         raise RequestError(f"reward {name} lies between {values.min():g} and {values.max():g}: it must lie between 0 and 1")
@@ -93,6 +106,8 @@ def audit(
     """
     if len(env.observation_spec.shape) != 3:
         raise RequestError("rewards are audited on images, and this task shows states: name its Visual variant")
+    for name, reward in rewards.items():
+        _check(name, reward, env.observation_spec.shape)
     pairs = with_noise(make_pairs(env, play(env, episodes, seed), seed), noise, seed)
     is_reached = pairs.distance <= env.threshold
     # Pairs of images with the end of their own episode are the first part of all pairs.
