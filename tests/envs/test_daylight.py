@@ -16,6 +16,7 @@ from jaxrl_vis_envs.plants.rendering.degrading import degrade
 from jaxrl_vis_envs.plants.rendering.surfaces import GROUND, NOTHING, OBJECT, build_surfaces
 from jaxrl_vis_envs.plants.scene import Scene
 from jaxrl_vis_envs.plants.settling import settle
+from jaxrl_vis_envs.plants.spec import read
 from jaxrl_vis_envs.plants.truth import stalks_in_view
 
 FAMILIES = Path(__file__).parents[2] / "benchmarks" / "stalks" / "families"
@@ -59,6 +60,13 @@ def test_families_without_days_are_as_they_were(family, sums):
     surfaces = build_surfaces(plot)
     found = [float(np.abs(part).sum()) for part in (surfaces.start, surfaces.radii, surfaces.corners, surfaces.materials)]
     np.testing.assert_allclose(found, sums, rtol=1e-5)
+
+
+def test_every_sampled_plot_keeps_the_limits_of_families():
+    """`Family` refuses values outside the limits, as plots of single low plants once had."""
+    family = read(FAMILIES / "daylight_all.toml")
+    plots = [settle(family, np.random.default_rng(seed)) for seed in range(1500)]
+    assert sum(plot.scene.share == 1 for plot in plots) > 500
 
 
 def test_a_night_of_a_mixed_family_is_one_without_days():

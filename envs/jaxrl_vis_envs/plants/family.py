@@ -10,7 +10,7 @@ import math
 import numbers
 from typing import Any
 
-from jaxrl_vis_envs.plants.scene import BOUNDS as SCENE_BOUNDS
+from jaxrl_vis_envs.plants.scene import BOUNDS as SCENEBOUNDS
 from jaxrl_vis_envs.plants.scene import Range, Scene
 
 INCH = 0.0254
@@ -230,7 +230,7 @@ def _check_value(label: str, example: Any, value: Any) -> None:
         raise ValueError(f"{label} must be a range, (low, high), got {value!r}")
     ends: tuple[Any, Any] = value if isinstance(example, tuple) else (value, value)
     low, high = ends
-    if not (is_number(low) and is_number(high)) or (low < 0 <= _BOUNDS.get(label, (0.0,))[0]):
+    if not (is_number(low) and is_number(high)) or (low < 0 <= BOUNDS.get(label, (0.0,))[0]):
         raise ValueError(f"{label} must be finite and at least 0, got {value}")
     if isinstance(example, int) and not isinstance(value, numbers.Integral):
         raise ValueError(f"{label} must be a whole number, got {value}")
@@ -239,7 +239,7 @@ def _check_value(label: str, example: Any, value: Any) -> None:
 
 
 # Limits of plausible values, and of memory. Fields without an entry must only be finite and at least 0.
-_BOUNDS: dict[str, tuple[float, float]] = {
+BOUNDS: dict[str, tuple[float, float]] = {
     "layout.plot_length": (0.1, 50.0),
     "layout.stalks_mean": (0, 1000),
     "layout.stalks_sd": (0, 500),
@@ -291,7 +291,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "imaging.vignetting": (0, 1),
     "imaging.blur": (0, 3.0),
     "imaging.full_well": (10.0, 1e7),
-    **SCENE_BOUNDS,
+    **SCENEBOUNDS,
 }
 
 
@@ -331,7 +331,7 @@ class Family:
             if dataclasses.is_dataclass(part):
                 for part_field in dataclasses.fields(part):
                     _check_value(f"{field.name}.{part_field.name}", part_field.default, getattr(part, part_field.name))
-        for label, (low, high) in _BOUNDS.items():
+        for label, (low, high) in BOUNDS.items():
             part, name = label.split(".")
             value = getattr(getattr(self, part), name)
             minimum, maximum = value if isinstance(value, tuple) else (value, value)

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from jaxrl_vis_envs.plants.family import Family, Layout, Leaves, Rig, Stalks, Textures
+from jaxrl_vis_envs.plants.family import BOUNDS, Family, Layout, Leaves, Rig, Stalks, Textures
 from jaxrl_vis_envs.plants.scene import Scene
 
 _MAIZE_STALKS = {
@@ -94,7 +94,8 @@ def _single(
     scene = dataclasses.replace(scene, camera_height=(camera_height, camera_height), pitch=(pitch, pitch))
     layout = dataclasses.replace(layout, plot_length=0.3, stalks_mean=1, stalks_sd=0.0, tillers=0.0, rows_behind=0)
     spacing = rng.uniform(0.06, 0.1) * tall
-    stalks = dataclasses.replace(stalks, height=(tall, tall), node_spacing=(0.7 * spacing, 1.3 * spacing))
+    shortest = max(0.7 * spacing, BOUNDS["stalks.node_spacing"][0])
+    stalks = dataclasses.replace(stalks, height=(tall, tall), node_spacing=(shortest, 1.3 * spacing))
     # Seen on its own, a plant keeps the leaves that machines strip from the lower part of a row.
     every = {"lower": rng.uniform(0.2, 1.0), "middle": rng.uniform(0.6, 1.0), "upper": 1.0}
     leaves = dataclasses.replace(leaves, **every, density=1.0, litter=leaves.litter * rng.uniform(0.0, 0.3))
