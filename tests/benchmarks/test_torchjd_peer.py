@@ -49,6 +49,7 @@ def test_tables_are_written_from_records(tmp_path: Path) -> None:
     theirs = [
         {"method": "mgda", "losses": 2, "what": what, "seconds": time} for what, time in (("alone", 2e-3), ("step", 5e-3))
     ]
-    record = {"device": "a GPU", "size": {"losses": [2]}, "ours": ours, "torchjd": theirs}
+    record = {"device": "a GPU", "size": {"losses": [2]}, "revisions": {"2": "0123456789"}, "ours": ours, "torchjd": theirs}
     (tmp_path / "weighting_cost-nvidia-h100.json").write_text(json.dumps(record))
-    assert "| `mgda` | 400 / 5,000 | 10 / 2,000 |" in (weighting.cost_table(tmp_path) or "")
+    table = weighting.cost_table(tmp_path) or ""
+    assert "| `mgda` | 400 / 5,000 | 10 / 2,000 |" in table and "K = 2 on 0123456:" in table

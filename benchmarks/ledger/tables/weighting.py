@@ -44,9 +44,12 @@ def _device_table(record: dict[str, Any]) -> str:
     ours, theirs = (
         {(row["method"], row["losses"], row["what"]): row["seconds"] for row in record[side]} for side in ("ours", "torchjd")
     )
+    sources = record["revisions"]
+    counts_of = {new: [count for count, old in sources.items() if old == new] for new in sources.values()}
+    revisions = ", ".join(f"K = {', '.join(same)} on {revision[:7]}" for revision, same in counts_of.items())
     head = ["method", *(f"step, K = {count}" for count in counts), f"weighting only, K = {counts[-1]}"]
     lines = [
-        f"{record['device']}, microseconds, ours / TorchJD's:",
+        f"{record['device']}, microseconds, ours / TorchJD's, {revisions}:",
         "",
         "| " + " | ".join(head) + " |",
         "|" + "---|" * len(head),

@@ -163,7 +163,8 @@ def time_peer(size: Size, count: int, python: Path | None) -> dict[str, Any]:
 def update(path: Path, size: Size, rows: dict[str, list[dict[str, Any]]], versions: dict[str, Any]) -> None:
     """Replace the rows of the numbers of losses in ``rows`` in the record, or start it anew if its conditions differ."""
     sizes = {**dataclasses.asdict(size), "losses": []}
-    empty = {"device": provenance.device_name(), "versions": versions, "size": sizes, "ours": [], "torchjd": []}
+    device = provenance.device_name()
+    empty = {"device": device, "versions": versions, "size": sizes, "revisions": {}, "ours": [], "torchjd": []}
     record = json.loads(path.read_text()) if path.exists() else empty
     if any(record[name] != empty[name] for name in ("device", "versions")) or {**record["size"], "losses": []} != sizes:
         record = empty
@@ -172,5 +173,5 @@ def update(path: Path, size: Size, rows: dict[str, list[dict[str, Any]]], versio
         remaining = [row for row in record[side] if row["losses"] not in fresh]
         record[side] = sorted(remaining + measured, key=lambda row: row["losses"])
     record["size"]["losses"] = sorted({*record["size"]["losses"], *fresh})
-    record["revision"] = provenance.revision()
+    record["revisions"] = {**record["revisions"], **{str(count): provenance.revision() for count in fresh}}
     write_atomically(path, json.dumps(record, indent=1) + "\n")
