@@ -59,7 +59,7 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/algorithms.md": {"forms": contrastive.forms_table},
     "docs/indicator_rewards.md": {"host": host.host_table, "audit": audit.audit_table},
     "docs/pixels.md": {"tasks": pixels.tasks_table, "training": pixels.training_table},
-    "docs/tasks.md": {"push on a GPU": push.gpu_table, "push on a CPU": push.cpu_table},
+    "docs/tasks.md": {"push on a GPU": push.gpu_table, "push on a CPU": push.cpu_table, "push from images": push.images_table},
     "docs/where_it_ran.md": {"platforms": platforms.platforms_table, "not run": platforms.not_run_table},
     "docs/weighting.md": {
         "digits": weighting.digits_table,

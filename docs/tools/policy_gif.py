@@ -1,8 +1,9 @@
-"""Render docs/images/reach.gif: the robot under a trained policy, its depth observation, and its goal image.
+"""Render a robot under a trained policy beside its observation and its goal image, as docs/images/reach.gif and push.gif show.
 
-python docs/tools/reach_gif.py RUN_DIR [--episodes 3]
+python docs/tools/policy_gif.py RUN_DIR OUT [--episodes 3]
 
-The policy observes images of the size of its run; the large images show the same states from the same camera.
+The policy observes images of the size of its run; the large images show the same states from the same camera. An episode is
+shown until the goal has been reached for `RESTED` steps.
 """
 
 import argparse
@@ -13,13 +14,14 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 import jaxrl_vis
-import jaxrl_vis_envs
+from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.report.videos import write_images
 from jaxrl_vis.run.storage.folder import read_config
+from jaxrl_vis.run.trained import shipped
 
-OUT = Path(__file__).resolve().parents[1] / "images" / "reach.gif"
 SIZE, MARGIN, CAPTION = 200, 8, 16
 SECONDS, LAST_SECONDS = 0.06, 1.0
+RESTED = 5
 
 
 def compose(panels: dict[str, np.ndarray]) -> Image.Image:
@@ -38,29 +40,39 @@ def compose(panels: dict[str, np.ndarray]) -> Image.Image:
     return picture
 
 
+def last_image(planes: jax.Array, channels: int) -> np.ndarray:
+    """Return the newest image of stacked planes [C, H, W] as [H, W, 3], or its depth [H, W] if it has no colours."""
+    image = np.asarray(planes)[-channels:]
+    return image[-1] if channels == 1 else np.moveaxis(image[:3], 0, -1)
+
+
 def main() -> None:
     """Roll out episodes and write the file."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("run_dir", type=Path)
+    parser.add_argument("out", type=Path)
     parser.add_argument("--episodes", type=int, default=3)
     options = parser.parse_args()
     policy = jaxrl_vis.load_policy(options.run_dir)
-    name = read_config(options.run_dir).environment.env
-    env, large = policy.env, jaxrl_vis_envs.make(name, image_size=SIZE, pixels="rgb")
+    config = read_config(shipped.find(options.run_dir))
+    env, channels = policy.env, {"rgbd": 4, "rgb": 3, "depth": 1}[config.environment.pixels]
+    large = make_env(config.replace(image_size=SIZE, pixels="rgb"))
     reset, step = jax.jit(env.reset), jax.jit(env.step)
     draw, draw_goal = jax.jit(large.observe), jax.jit(lambda key: large.reset(key).obs["desired_goal"])
     images, seconds = [], []
     for key in jax.random.split(jax.random.key(1), options.episodes):
-        state, goal = reset(key), np.moveaxis(np.asarray(draw_goal(key))[-3:], 0, -1)
-        for _ in range(env.horizon // 2):  # then it rests at its goal
-            observed = np.asarray(state.obs["observation"])[-1]
-            panels = {"robot": np.moveaxis(np.asarray(draw(state))[-3:], 0, -1), "what it observes (depth)": observed}
-            images.append(compose(panels | {"goal image (it sees its depth)": goal}))
+        state, goal, rested = reset(key), last_image(draw_goal(key), 3), 0
+        for _ in range(env.horizon):
+            observed = last_image(state.obs["observation"], channels)
+            images.append(compose({"robot": last_image(draw(state), 3), "what it observes": observed, "goal image": goal}))
             seconds.append(SECONDS)
+            rested = rested + 1 if float(state.metrics["success"]) else 0
+            if rested > RESTED:
+                break
             state = step(state, policy(state.obs["observation"], state.obs["desired_goal"]))
         seconds[-1] = LAST_SECONDS
-    write_images(images, seconds, OUT, SECONDS)
-    print(f"{OUT}: {OUT.stat().st_size / 1e6:.2f} MB, {len(images)} frames")
+    write_images(images, seconds, options.out, SECONDS)
+    print(f"{options.out}: {options.out.stat().st_size / 1e6:.2f} MB, {len(images)} frames")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Tables of docs/tasks.md: FetchPush learned from states, from the runs in ``results/push``."""
+"""Tables of docs/tasks.md: FetchPush learned from states and from images, from the runs in ``results/push``."""
 
 import textwrap
 from collections.abc import Sequence
@@ -13,6 +13,20 @@ from jaxrl_vis.run.storage.metrics import read_rows
 SUCCESS = "eval/success"
 _COLUMNS = ("env_steps", "updates", "train/moved", "train/success", SUCCESS)
 _ROWS = 10
+_IMAGES = {
+    "images_oracle": "true success",
+    "images_oracle_aux": "true success, five auxiliary losses (OL-AUX)",
+    "images_oracle_td3": "true success, TD3",
+    "images_oracle_plain": "true success, critic observes images",
+    "images_filter_mask": "`indicator_balance_filter`, box's pixels",
+    "images_filter_mask_td3": "`indicator_balance_filter`, box's pixels, TD3",
+    "images_tolerance_mask": "`indicator_tolerance`, box's pixels",
+    "images_filter": "`indicator_balance_filter`, whole image",
+    "images_autoencoder": "`autoencoder`",
+    "images_contrastive": "contrastive RL without a reward, critic observes images",
+}
+"""Rows of `images_table`: folders of the runs, and their reward."""
+_IMAGES_STEPS = (250_000, 500_000, 750_000, 1_000_000)
 
 
 def cpu_table(results: Path) -> str | None:
@@ -23,6 +37,38 @@ def cpu_table(results: Path) -> str | None:
 def gpu_table(results: Path) -> str | None:
     """Return the table of the run on an H100 as Markdown; None without its record."""
     return _table(results / "push" / "states_h100")
+
+
+def images_table(results: Path) -> str | None:
+    """Return the success of all runs from images after some environment steps as Markdown; None without records."""
+    rows, sources = [], set()
+    for name, label in _IMAGES.items():
+        folder = results / "push" / name
+        if not folder.is_dir():
+            continue
+        evaluations = [row for row in read_rows(folder / "metrics.jsonl") if SUCCESS in row]
+        by_step = {step: [row for row in evaluations if row["env_steps"] == step] for step in _IMAGES_STEPS}
+        cells = [_mean_and_range([row[SUCCESS] for row in by_step[step]]) for step in _IMAGES_STEPS]
+        last = evaluations[-1]
+        seeds = len({row["seed"] for row in evaluations})
+        moved = np.mean([row["eval/moved"] for row in evaluations if row["env_steps"] == last["env_steps"]])
+        end = "" if last["env_steps"] >= _IMAGES_STEPS[-1] else f", stopped after {last['env_steps']:,}"
+        minutes = f"{last['time/wall_s'] / 60:.0f} min{end}"
+        rows.append("| " + " | ".join((label, str(seeds), *cells, f"{moved:.2f}", minutes)) + " |")
+        record = read_record(folder)
+        sources.add(f"{record['git_revision'][:7]} on {record['device']['name']}")
+    if not rows:
+        return None
+    steps = " | ".join(f"{step:,}" for step in _IMAGES_STEPS)
+    caption = f"Mean (minimum to maximum) over seeds, all in one program; {'; '.join(sorted(sources))}."
+    heading = f"| reward | seeds | {steps} steps | box moves | in all |"
+    return "\n".join([heading, "|---" * (len(_IMAGES_STEPS) + 4) + "|", *rows, "", textwrap.fill(caption, WIDTH)])
+
+
+def _mean_and_range(values: Sequence[float]) -> str:
+    """Return the mean of seeds' values with their range, if there are several; an empty cell without values."""
+    spread = f" ({min(values):.2f} to {max(values):.2f})" if len(values) > 1 else ""
+    return f"{np.mean(values):.2f}{spread}" if values else ""
 
 
 def _table(folder: Path) -> str | None:
