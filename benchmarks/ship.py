@@ -18,7 +18,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.run.pushed.card import Score, card, score
 from jaxrl_vis.run.pushed.push import public_record
-from jaxrl_vis.run.storage.folder import RunFolder
+from jaxrl_vis.run.storage.folder import RunFolder, read_config
 from jaxrl_vis.run.trained import policy_file, shipped
 from jaxrl_vis.run.trained.policy import load_policy
 from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
@@ -77,7 +77,7 @@ def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None =
             f"({size / 1e6:.2f} MB), and the figures are theirs; in float32 success is {score_float32.success:.3f}."
         )
         text = card(
-            policy.config,
+            read_config(run_dir),
             record,
             policy.seed,
             {policy.seed: score_float16},

@@ -28,6 +28,7 @@ MIN_SUCCESS = {
     "sawyer": 0.9,
     "hand": 0.85,
     "finger": 0.9,
+    "push": 0.95,
     "reacher": 0.0,
 }  # at the last step, over fresh episodes, as the card says
 
