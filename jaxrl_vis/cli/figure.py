@@ -15,7 +15,9 @@ from jaxrl_vis.report.outputs import check_figure, check_writable
 if TYPE_CHECKING:
     from jaxrl_vis.studies.figures.show import Request
 
-FigureName = Literal["5.1", "5.2", "estimators", "cameras", "goals", "5.4", "5.5", "5.6", "5.7", "quadratic", "pareto"]
+FigureName = Literal[
+    "5.1", "5.2", "estimators", "cameras", "goals", "5.4", "5.5", "5.6", "5.7", "weightings", "quadratic", "pareto"
+]
 UNFINISHED = 3
 """Exit status of an incomplete figure."""
 
@@ -27,8 +29,8 @@ class Figure:
     5.1, 5.2: rewards with and without ground truth. estimators: rewards from imperfect state estimators. cameras: noisy and
     randomized images. goals: comparison of all kinds of rewards, TD3 and contrastive RL. 5.4: auxiliary losses and their
     weightings. 5.5: single auxiliary tasks. 5.6: their weights over training. 5.7: effect of looking ahead in OL-AUX-5.
-    These train missing runs, one process per GPU, and resume unfinished ones, so they may be interrupted and started again
-    at any time; the exit status is 3 if something is still missing.
+    weightings: all weightings of five auxiliary losses. These train missing runs, one process per GPU, and resume unfinished
+    ones, so they may be interrupted and started again at any time; the exit status is 3 if something is still missing.
 
     quadratic: adaptive weights of auxiliary losses on three losses of a point in the plane. pareto: paths to the Pareto front
     of two losses, by twelve weightings. These train nothing, and --out is their only option. Figures of stalks:
@@ -60,8 +62,8 @@ class Figure:
     env_options: tuple[str, ...] = ()
     """Settings of the environment in every run, as in `train`: view=fingertips tip_marks=faint."""
     runs: Path | None = None
-    """Folder of all run folders and logs, shared by figures on one subject; runs/ol_aux, runs/indicator or runs/goals if not
-    given."""
+    """Folder of all run folders and logs, shared by figures on one subject; runs/ol_aux, runs/indicator, runs/goals or
+    runs/weightings if not given."""
     minutes: float | None = None
     """Time limit in minutes: runs are saved, finished ones are drawn, and the next start resumes."""
     per_device: int = 1

@@ -4,7 +4,7 @@ FIGURE.png   lines of finished cells; in figures 5.4, 5.5 and 5.7 also those rel
 FIGURE.md    tables, and a description of the runs
 FIGURE.csv   the same numbers, for further processing
 
-`ol_aux`, `indicator` and `goals` define the runs of a figure; files with similar names in this folder their presentation.
+`ol_aux`, `indicator`, `goals` and `weightings` define the runs of a figure; files in this folder their presentation.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,19 +14,20 @@ from jaxrl_vis.host import streams
 from jaxrl_vis.host.devices import list_devices, shared
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.spreadsheets import to_csv
-from jaxrl_vis.studies import goals, indicator, ol_aux
+from jaxrl_vis.studies import goals, indicator, ol_aux, weightings
 from jaxrl_vis.studies.engine.grid import run_cells
 from jaxrl_vis.studies.engine.results import Line, read_lines
 from jaxrl_vis.studies.engine.study import Study, make_cells
-from jaxrl_vis.studies.figures import goals_figure, indicator_figures, ol_aux_figures
+from jaxrl_vis.studies.figures import comparison_figure, indicator_figures, ol_aux_figures
 from jaxrl_vis.studies.figures.drawing import draw_panels
 from jaxrl_vis.studies.figures.show import FigureContent, Request
 
-STUDIES: dict[str, Study] = {**indicator.STUDIES, **goals.STUDIES, **ol_aux.STUDIES}
+STUDIES: dict[str, Study] = {**indicator.STUDIES, **goals.STUDIES, **ol_aux.STUDIES, **weightings.STUDIES}
 """Studies by figure."""
 
 _MAKE_CONTENT: dict[str, Callable[..., FigureContent]] = {
-    goals.FAMILY.name: goals_figure.make_content,
+    goals.FAMILY.name: comparison_figure.make_content,
+    weightings.FAMILY.name: comparison_figure.make_content,
     indicator.FAMILY.name: indicator_figures.make_content,
     ol_aux.FAMILY.name: ol_aux_figures.make_content,
 }

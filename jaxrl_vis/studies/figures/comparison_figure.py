@@ -1,4 +1,4 @@
-"""Content of figure ``goals``: success against steps and against wall-clock time, and a table with intervals."""
+"""Content of figures ``goals`` and ``weightings``: success against steps and wall-clock time, and a table with intervals."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from jaxrl_vis.studies.engine.results import SUCCESS, Line, final_quartiles, find_steps
+from jaxrl_vis.studies.engine.study import Variant
 from jaxrl_vis.studies.figures.drawing import Curve, Panel, Picture
 from jaxrl_vis.studies.figures.show import FigureContent, Request
 from jaxrl_vis.studies.figures.tables import table_row
-from jaxrl_vis.studies.goals import VARIANTS
 from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean
 
 LEVEL = 0.9
@@ -18,13 +18,14 @@ _WALL, _COMPILATION = "time/wall_s", "time/compile_s"
 
 
 def make_content(
-    _: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]
+    request: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]
 ) -> FigureContent:
     """Create the panels and tables of the figure for these tasks and variants, from its lines by (task, variant)."""
     shown = {key: line for key, line in lines.items() if key[1] in variants}
-    of_steps = [Panel(f"{task}: success", _curves(shown, task)) for task in tasks]
-    of_seconds = [Panel(f"{task}: success, by seconds", _curves(shown, task, by_seconds=True)) for task in tasks]
-    text, rows = _tables(shown, tasks)
+    known = request.study.family.variants
+    of_steps = [Panel(f"{task}: success", _curves(shown, known, task)) for task in tasks]
+    of_seconds = [Panel(f"{task}: success, by seconds", _curves(shown, known, task, by_seconds=True)) for task in tasks]
+    text, rows = _tables(shown, known, tasks)
     notes = [
         "Mean success: over all evaluations of a run, the area under its curve; interquartile mean over seeds with its 95 % "
         f"bootstrap interval. Steps to {LEVEL:g}: the evaluation there and the next two are at least that, in the median over "
@@ -34,13 +35,15 @@ def make_content(
     return FigureContent([Picture("", [of_steps, of_seconds])], text, rows, notes)
 
 
-def _curves(lines: Mapping[tuple[str, str], Line], task: str, by_seconds: bool = False) -> list[Curve]:
+def _curves(
+    lines: Mapping[tuple[str, str], Line], known: Mapping[str, Variant], task: str, by_seconds: bool = False
+) -> list[Curve]:
     curves = []
     for (of_task, variant), line in lines.items():
         if of_task == task:
             steps, values = line.values(SUCCESS)
             positions = np.array([_seconds(line, count) for count in steps]) if by_seconds else steps
-            curves.append(Curve(VARIANTS[variant].label, VARIANTS[variant].colour, positions, values))
+            curves.append(Curve(known[variant].label, known[variant].colour, positions, values))
     return curves
 
 
@@ -50,7 +53,9 @@ def _seconds(line: Line, steps: int) -> float:
     return float((row.get(_WALL) or 0.0) - (row.get(_COMPILATION) or 0.0))
 
 
-def _tables(lines: Mapping[tuple[str, str], Line], tasks: Sequence[str]) -> tuple[list[str], list[dict[str, Any]]]:
+def _tables(
+    lines: Mapping[tuple[str, str], Line], known: Mapping[str, Variant], tasks: Sequence[str]
+) -> tuple[list[str], list[dict[str, Any]]]:
     text, rows = [], []
     columns = ["method", "mean success, IQM (95 %)", "success at the end", f"steps to {LEVEL:g}", f"s to {LEVEL:g}", "s in all"]
     for task in tasks:
@@ -65,7 +70,7 @@ def _tables(lines: Mapping[tuple[str, str], Line], tasks: Sequence[str]) -> tupl
             end = final_quartiles(line)
             cells = [f"{mean:.3f} ({low:.3f} to {high:.3f})", f"{end[1]:.3f} ({end[0]:.3f} to {end[2]:.3f})", str(until)]
             cells += ["–" if seconds is None else f"{seconds:.0f}", f"{_seconds(line, line.end):.0f}"]
-            text.append(table_row([VARIANTS[variant].label, *cells]))
+            text.append(table_row([known[variant].label, *cells]))
             rows.append(
                 dict(
                     task=task,

@@ -1,4 +1,4 @@
-"""Figure ``goals``: its runs are what they are called, and its table is that of runs that were made up."""
+"""Figures ``goals`` and ``weightings``: their runs are what they are called, and a table is that of made-up runs."""
 
 import csv
 import json
@@ -10,8 +10,10 @@ from test_studies_figures import has_colour, made_up, slope
 from jaxrl_vis import cli
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.studies import goals
+from jaxrl_vis.studies import goals, weightings
 from jaxrl_vis.studies.engine.study import Scope, make_cells
+from jaxrl_vis.studies.ol_aux import AUX_TASKS
+from jaxrl_vis.weighting import WEIGHTINGS
 
 STUDY = goals.STUDIES["goals"]
 
@@ -61,3 +63,12 @@ def test_the_table_has_intervals_steps_and_seconds(tmp_path: Path) -> None:
     assert float(oracle["mean_success_low"]) <= float(oracle["mean_success"]) <= float(oracle["mean_success_high"])
     line = next(row for row in out.with_suffix(".md").read_text().splitlines() if row.startswith("| contrastive |"))
     assert "> 50 k" in line and line.endswith("| – | 60 |")
+
+
+def test_every_weighting_is_a_valid_run_of_the_figure_weightings() -> None:
+    study = weightings.STUDIES["weightings"]
+    cells = make_cells(study, tuple(study.steps), study.variants, Scope("fast"))
+    used = {cell.config.auxiliary.weighting for (cell,) in cells.values()}
+    assert used == set(WEIGHTINGS) - {"none_log", "fixed", "ol_aux_ablation"}
+    assert all(cell.config.auxiliary.aux_tasks == AUX_TASKS for (_, name), (cell,) in cells.items() if name != "none")
+    assert len({variant.colour for variant in study.family.variants.values()}) == len(study.variants)
