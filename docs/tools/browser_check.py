@@ -1,7 +1,7 @@
 """Open the playable page in headless Chromium and compare it with our renderer, policy and physics: `make page-check`.
 
-The site must be built with the page's data: `make page docs`. Each figure is printed with its bounds. Exit status: 0 all
-figures are within their bounds; 1 one is not or is missing, or the page does not run; 2 there is no page or no browser.
+The site must be built with the page's data: `make page docs`. Each measurement is printed with its bounds. Exit status: 0 all
+measurements are within their bounds; 1 one is not, or is missing, or the page does not run; 2 there is no page or no browser.
 """
 
 import argparse
@@ -38,14 +38,14 @@ BOUNDS: dict[str, tuple[float, float]] = {
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """Request handler that serves the site and receives the page's figures."""
+    """Request handler that serves the site and receives the page's measurements."""
 
     def __init__(self, *args: Any, results: "queue.Queue[dict[str, Any]]", **options: Any):
         self._results = results
         super().__init__(*args, **options)
 
     def do_POST(self) -> None:
-        """Put the figures that the page posts as JSON on the queue ``results``."""
+        """Put the measurements that the page posts as JSON on the queue ``results``."""
         self._results.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
         self.send_response(204)
         self.end_headers()
@@ -55,7 +55,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 
 
 def measure(site: Path, browser: str, seconds: float) -> dict[str, Any]:
-    """Open the page in a browser and return its figures by name.
+    """Open the page in a browser and return its measurements by name.
 
     Args:
         site: Folder of the built site.
@@ -63,7 +63,7 @@ def measure(site: Path, browser: str, seconds: float) -> dict[str, Any]:
         seconds: Timeout, s.
 
     Returns:
-        The figures; only ``error``, a message, if the page posts none in time or fails.
+        The measurements; only ``error``, a message, if the page posts none in time or fails.
     """
     results: queue.Queue[dict[str, Any]] = queue.Queue()
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=str(site), results=results))

@@ -29,7 +29,7 @@ def measurement(value: float, envs: int = 4, unit: str = "images/s") -> Measurem
 
 
 def under(speed: float = 1.0, **changes: Any) -> dict[str, Any]:
-    """Conditions of an idle machine, at ``speed`` times a speed."""
+    """Return the conditions of an idle machine whose calibration is ``speed`` times the usual one."""
     calibration = {"gflops": 100.0 * speed, "gbytes_per_s": 10.0 * speed}
     same = {"machine": "a", "cores": 2, "busy_cores": 0.0, "calibration": {"before": calibration, "after": calibration}}
     return {**same, **changes}
@@ -69,7 +69,7 @@ def test_record_round_trip_and_change(tmp_path: Path, capsys: pytest.CaptureFixt
     ],
 )
 def test_only_like_is_compared_with_like(now: dict, then: dict | None, why: str) -> None:
-    """A machine of the same name at 0.58 times the speed was once told as a loss of 42 %."""
+    """Regression test: a machine of the same name at 0.58 times the speed was reported as a loss of 42 %."""
     old, new = (record.to_record(measurement(value), each) for value, each in ((100.0, then), (58.0, now)))
     line = record.describe(new, old)
     assert line.endswith(f": {why})") and "not compared with 100 of" in line and "42 %" not in line
@@ -103,7 +103,7 @@ def test_a_calibration_keeps_no_more_than_two_results_at_a_time(monkeypatch: pyt
 
 
 def test_what_a_machine_is_calibrated_with_is_computed_when_it_is_measured() -> None:
-    """Constants would be computed by the compiler: for minutes on a GPU, and then never again."""
+    """Constants would be folded by the compiler, for minutes on a GPU, and not computed when the machine is measured."""
     for work in conditions.calibrations().values():
         bytes_of_arguments = sum(array.nbytes for array in work.arguments)
         assert work.program.memory_analysis().argument_size_in_bytes == bytes_of_arguments > 0  # type: ignore[attr-defined]
@@ -148,7 +148,7 @@ def test_a_file_of_something_else_is_not_overwritten(tmp_path: Path) -> None:
 def test_a_damaged_file_is_told_before_anything_is_measured(
     contents: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The figure would be lost: it could not be kept."""
+    """Otherwise the measurement would be lost, because it could not be stored."""
     path = record.results_path("physics", tmp_path)
     path.write_text(contents)
     monkeypatch.setattr(physics, "measure", lambda _: pytest.fail("measured"))
@@ -234,7 +234,7 @@ def test_noise_fills_the_whole_replay() -> None:
 
 
 class Dot(GoalEnv):
-    """A bright dot that moves in a dark image: an environment that compiles at once."""
+    """Environment that compiles quickly: a bright dot moves in a dark image."""
 
     name, horizon, action_size, threshold, control_period = "Dot", 3, 2, 0.1, 0.1
 
@@ -262,9 +262,9 @@ class Dot(GoalEnv):
 
 @pytest.fixture
 def dots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two environments: one whose dot moves, and one whose dot does not. Images are told by the configuration, not the name.
+    """Environments ``Dot``, whose dot moves, and ``StillDot``, whose dot does not; their configuration marks them as visual.
 
-    What is timed is not repeated until the clock can tell it from noise: no test looks at how large a figure is.
+    Measurements are shorter than usual, because no test depends on their values.
     """
     monkeypatch.setattr(timing, "_MIN_SECONDS", 0.01)
     for name, moves in (("Dot", True), ("StillDot", False)):

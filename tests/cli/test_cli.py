@@ -27,7 +27,7 @@ from jaxrl_vis.run.command import training_options
 
 
 def one_line(capsys: pytest.CaptureFixture[str], status: int) -> str:
-    """Checks the report of a wrong request: exactly one line, on stderr, with exit status 2."""
+    """Return the report of a wrong request, after checking that it is one line on stderr, with exit status 2."""
     output = capsys.readouterr()
     assert status == 2
     assert output.out == ""
@@ -43,7 +43,7 @@ HELP = [[], ["phenotype"], *(name.split() for name in cli.all_commands())]
 
 @pytest.fixture(scope="module")
 def helped() -> list[tuple[list[str], str]]:
-    """Return, for each command of `HELP`, the heavy packages imported after it, and its output; all run in one process."""
+    """Heavy packages imported after each command of `HELP`, and its output; all run in one process."""
     code = f"""
 import contextlib, io, json, sys
 from jaxrl_vis import cli
@@ -286,7 +286,7 @@ def test_the_package_runs_as_a_program(clean_environment: dict[str, str]) -> Non
 
 @pytest.fixture
 def places(tmp_path: Path) -> dict[str, Path]:
-    """A run folder that nothing can be read of, and paths that cannot be written, by what is wrong with them."""
+    """A run folder that cannot be read, and paths that cannot be written, by the expected error."""
     run = tmp_path / "run"
     run.mkdir()
     (run / "config.json").write_text("{}")
@@ -308,7 +308,7 @@ def places(tmp_path: Path) -> dict[str, Path]:
 def test_outputs_are_checked_before_the_work(
     words: list[str], suffix: str, places: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Nothing works here: the run holds nothing, and a benchmark or a gallery would take longer than this test may."""
+    """No command could succeed: the run is empty, and a benchmark or a gallery would take longer than this test allows."""
     run = places.pop("run")
     for wrong, place in places.items():
         path = place.with_suffix(suffix)

@@ -34,7 +34,7 @@ HORIZON = probes.Probe.horizon
 
 
 class Wide(probes.PointImage):
-    """Images of different height, width and channels."""
+    """Probe whose images differ in height, width and number of channels."""
 
     def see(self, position):
         return super().see(position)[:, :2].repeat(3, axis=0)

@@ -1,4 +1,4 @@
-"""FetchPush: starts, goals, what goals tell, and contacts of boxes. Its physics: tests/physics/test_physics_parity.py."""
+"""FetchPush: starts, goals, relabelled goals, and contacts of boxes. Its physics: tests/physics/test_physics_parity.py."""
 
 import functools
 
@@ -61,7 +61,7 @@ def test_places_that_cannot_be_drawn(overrides, complaint):
 
 
 def test_a_goal_tells_of_the_box_alone():
-    """A relabelled goal has the form of those that are drawn, wherever arm and box were and however they moved."""
+    """A relabelled goal has the form of sampled goals, and depends on the box's position alone, however arm and box moved."""
     env = environments.make("FetchPush")
     desired = jaxrl_vis_envs.jit(lambda key: env.observe_state(env.sample_goal(key)))(jax.random.key(3))
     np.testing.assert_allclose(env.as_goal(desired), desired, atol=2e-6)

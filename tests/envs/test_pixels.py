@@ -112,7 +112,7 @@ class PlaygroundEnv:
 
 
 def truth(mj_model: mujoco.MjModel, qpos: Any, camera: str | int, size: int = SIZE) -> Frame:
-    """The image of a model at joint positions, by the renderer alone."""
+    """Return the image of a model at joint positions, rendered directly."""
     mj_data = mujoco.MjData(mj_model)
     mj_data.qpos[:] = qpos
     mujoco.mj_forward(mj_model, mj_data)
@@ -120,7 +120,7 @@ def truth(mj_model: mujoco.MjModel, qpos: Any, camera: str | int, size: int = SI
 
 
 def assert_same_colours(image: Any, frame: Frame) -> None:
-    """Float images from 0 to 1 equal those of a frame, but for rounding at edges."""
+    """Compare float images from 0 to 1 with those of a frame, apart from rounding at edges."""
     difference = np.abs(np.rint(255.0 * np.asarray(image)) - np.asarray(frame.rgb))
     assert np.mean(difference > 1) < 0.01 and np.asarray(frame.rgb).std() > 5
 
@@ -172,7 +172,7 @@ def test_several_frames_show_the_last_images(layout: Any) -> None:
         return states
 
     def stack(state: Any) -> np.ndarray:
-        """The three images, then that of the goal: [4, H, W, 3]."""
+        """Return the three images and that of the goal, [4, H, W, 3]."""
         names = ("pixels/front", "pixels/front/goal")
         joined = state.obs if layout == "image" else jnp.concatenate([state.obs[name] for name in names], axis=-1)
         return np.moveaxis(np.asarray(joined).reshape(SIZE, SIZE, 4, 3), 2, 0)

@@ -196,7 +196,7 @@ def test_each_range_of_the_dynamics_scales_its_leaves(task: str) -> None:
 
 
 def test_mjx_steps_a_varied_model_as_mujoco_does() -> None:
-    """The changed leaves exist in MuJoCo's own model: C MuJoCo with the same values moves the same."""
+    """The changed leaves exist in MuJoCo's own model: with the same values, C MuJoCo moves in the same way."""
     end = jax.tree.map(lambda leaf: np.asarray(leaf[0], np.float64), episodes(ALL)[1])
     start = episodes(ALL)[0]
     model = mujoco.MjModel.from_xml_string(point_mass.XML)

@@ -44,7 +44,7 @@ def in_ascii():
 
 
 class Odd(io.StringIO):
-    """A stream of a notebook whose kernel is gone."""
+    """Stream of a notebook whose kernel has died."""
 
     def write(self, text):
         raise RuntimeError("no kernel")
@@ -60,7 +60,7 @@ BROKEN = {
 
 
 def let_go(stream) -> None:
-    """Closes a stream that may hold what it cannot write."""
+    """Close a stream that may hold data that it cannot write."""
     with contextlib.suppress(OSError):
         if stream is not None:
             stream.close()
@@ -113,7 +113,7 @@ def test_a_run_goes_on_when_its_terminal_is_gone(tmp_path, monkeypatch):
 
 
 def shown_on_a_terminal(width, monkeypatch, show) -> list[str]:
-    """Returns the last lines of a terminal of a given width."""
+    """Return the lines that ``show`` prints on a terminal of a given width."""
     keeper, terminal = pty.openpty()
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", str(width))

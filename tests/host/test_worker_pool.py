@@ -1,4 +1,4 @@
-"""Numbers evaluated in processes side by side, and the file that keeps what came of them."""
+"""Evaluation of numbers in parallel processes, and the file that stores the results."""
 
 import functools
 import itertools
@@ -47,7 +47,7 @@ def killed(number: int) -> Record:
 
 
 def signalled(number: int) -> Record:
-    """Signals itself, as somebody would who signals the whole group of processes."""
+    """Send all signals to this process, as somebody would who signals the whole process group."""
     for item in signals.SIGNALS:
         subprocess.run(["kill", f"-{item}", str(os.getpid())], check=True)
     return {"ignored": sorted(signal.pthread_sigmask(signal.SIG_BLOCK, ()))}
@@ -154,7 +154,7 @@ def wait_until(holds: Callable[[], bool], seconds: float) -> None:
 
 
 def runs(process: int) -> bool:
-    """Returns True if a process runs; an ended one may still be listed."""
+    """Return True if a process is running; an ended one may still be listed."""
     try:
         os.kill(process, 0)
         status = Path(f"/proc/{process}/stat")

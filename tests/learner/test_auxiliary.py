@@ -51,13 +51,13 @@ def config(**overrides):
 
 @functools.cache
 def drawn_places():
-    """Episodes and slots of a batch, [2, B]."""
+    """Return random episodes and slots of a batch, [2, B]."""
     return jax.device_get(jax.random.randint(jax.random.key(1), (2, BATCH), 0, EPISODES))
 
 
 @functools.cache
 def stored(with_flow):
-    """The rollout as a learner stores it that does or does not learn optical flow."""
+    """Return the rollout as stored by a learner that learns optical flow, or by one that does not."""
     if not with_flow:
         return rollout()
     auxiliary = make_auxiliary(config(aux_tasks=("optical_flow",), weighting="sum"), SPEC, ACTIONS, 1, jnp.float32)
@@ -66,7 +66,7 @@ def stored(with_flow):
 
 @functools.cache
 def fresh(tasks, encoders, target_encoder, filters):
-    """A fresh learner but for the state of its weighting: how losses are weighted changes nothing else at the beginning."""
+    """Return a fresh learner with any weighting, because weightings change nothing else at initialisation."""
     networks = {"encoders": encoders, "target_encoder": target_encoder, "encoder_filters": filters}
     chosen = config(aux_tasks=tasks, weighting="sum" if tasks else "none", **networks)
     algorithm = make_ddpg(Networks(chosen, SPEC, ACTIONS, 0.0), chosen, resolve(chosen, HORIZON))
@@ -76,7 +76,7 @@ def fresh(tasks, encoders, target_encoder, filters):
 
 @functools.cache
 def learner(mode=None, **overrides):
-    """The learner, one update as a compiled function, and its state and batch at the beginning."""
+    """Return a learner, its update as a compiled function, and its initial state and batch."""
     chosen = config(**overrides)
     networks = Networks(chosen, SPEC, ACTIONS, 0.0)
     auxiliary = make_auxiliary(chosen, SPEC, ACTIONS, 1, networks.dtype)
@@ -107,7 +107,7 @@ def learner(mode=None, **overrides):
 
 
 def sizes(tree):
-    """The norm of each part."""
+    """Return the root mean square of each part, averaged over its leaves."""
     return {
         name: float(np.sqrt(np.mean([np.mean(np.square(x)) for x in jax.tree.leaves(part)]))) for name, part in tree.items()
     }
@@ -127,7 +127,7 @@ def test_every_auxiliary_loss_is_learned_and_reaches_both_encoders():
 
 
 def test_a_weighted_gradient_is_the_sum_of_the_losses_own():
-    """With fixed weights, the gradient with two tasks is the sum of those with one task each, less their common part."""
+    """With fixed weights, the gradient with two tasks is the sum of those with one task each, less that without tasks."""
     found = {}
     for tasks in ((), ("inverse_dynamics",), ("egomotion",), ("inverse_dynamics", "egomotion")):
         weighting = {"weighting": "fixed", "weighting_fixed": 3.0} if tasks else {"weighting": "none_log"}
@@ -289,7 +289,7 @@ def test_both_ways_to_a_gramian_train_alike():
 
 
 def test_a_main_loss_that_is_like_the_others_is_weighted_in_both_networks():
-    """`uniform` has a third of the sum's gradients; where weights are for encoders alone, heads learn as from the sum."""
+    """`uniform` yields a third of the sum's gradients; where weights are for encoders alone, heads learn as with the sum."""
     found = {}
     for weighting in ("sum", "uniform", "mgda"):
         _, update, working, batch = learner(aux_tasks=TWO, weighting=weighting)
@@ -357,7 +357,7 @@ def test_an_actor_learns_the_logarithm_of_value_and_penalty_together_where_asked
 
 
 def test_a_head_begins_alike_wherever_its_task_stands_in_the_list():
-    """Runs of the thesis's five tasks repeat themselves, and a task from elsewhere needs no place among them."""
+    """Keys of built-in heads depend neither on the order of tasks nor on user-defined ones, so that runs stay reproducible."""
     key = jax.random.key(3)
     made = list(auxtasks.make([*reversed(ALL)], auxtasks.Spec(SPEC, ACTIONS, 8)).values())
     new = [auxtasks.AuxTask(name, made[0].init, lambda *_: 0.0, lambda *_: 0.0) for name in ("new_one", "another")]

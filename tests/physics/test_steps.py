@@ -1,6 +1,6 @@
 """Physics steps of the scalar engine, and their GPU kernel, which Pallas's interpreter runs here.
 
-For a whole step of the hand NumPy does the arithmetic, in float32, too: to compile it for a CPU takes minutes.
+Whole steps of the hand are computed by NumPy, in float32, too, because compilation for a CPU takes minutes.
 """
 
 import contextlib
@@ -92,7 +92,7 @@ def odd_model(warmstart: str = "enable") -> mujoco.MjModel:
 
 
 class Float32Numpy:
-    """NumPy's functions, for which plain numbers have no type of their own, as in JAX."""
+    """NumPy's functions, in which Python's numbers do not determine the dtype, as in JAX."""
 
     inf = np.inf
 
@@ -125,7 +125,7 @@ def branch_of_numpy(condition, one, other):
 
 @contextlib.contextmanager
 def arithmetic_of(numpy: Any) -> Iterator[None]:
-    """Lets NumPy, or what behaves like it, do the arithmetic of the scalar engine."""
+    """Let NumPy, or an object with its functions, compute the arithmetic of the scalar engine within the context."""
     arithmetic = (constraint_softness, contacts, friction_cones, line_search, partial_arithmetic, quaternions)
     arithmetic += (scalar_newton, sparse_algebra, steps, welds)
     with pytest.MonkeyPatch.context() as patch, np.errstate(over="ignore"):
@@ -138,7 +138,7 @@ def arithmetic_of(numpy: Any) -> Iterator[None]:
 
 
 def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: Any = True) -> steps.JointState:
-    """`steps.simulate` of a batch, [B, N] each, in NumPy."""
+    """Return the states [B, N] of a batch after `steps.simulate` in NumPy."""
     constants = scalar_model.build_scalar_model(model)
     used = list(constants.mocaps)
     mocap = np.concatenate([data.mocap_pos[:, used], data.mocap_quat[:, used]], axis=2).reshape(data.qpos.shape[0], -1)
@@ -152,7 +152,7 @@ def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: 
 
 @functools.cache
 def steps_by_matrices(name: str):
-    """Function of a batch and a number of steps; the number is an argument, so that one program takes any."""
+    """Return a function of a batch and a number of steps; the number is an argument, so that one program serves any number."""
     env = environments.make(name)
 
     def one_step(_: Any, data: mjx.Data) -> mjx.Data:
@@ -167,7 +167,7 @@ def by_matrices(name: str, count: int):
 
 
 def repeated(data: mjx.Data, count: int) -> mjx.Data:
-    """Return ``count`` copies, made on the host: on a device, each size of leaf would be a program to compile."""
+    """Return ``count`` copies, made on the host, because a device would need a program for each size of leaf."""
     return jax.tree.map(lambda leaf: np.tile(leaf, (count,) + (1,) * leaf.ndim), jax.device_get(data))
 
 
@@ -271,7 +271,7 @@ REACHER_SUBSTEPS = 10
 
 
 def reacher_states(count: int) -> mjx.Data:
-    """The reacher at random velocities and torques, half of the elbows within a step of the limit, on either side of it."""
+    """Return states at random velocities and torques, half of the elbows within a step of the limit, on either side of it."""
     rng = np.random.default_rng(6)
     elbow = np.concatenate(
         [rng.uniform(-2.5, 2.5, count // 2), rng.choice([-1, 1], count // 2) * rng.uniform(2.9, 3.05, count // 2)]
@@ -440,7 +440,7 @@ def test_the_kernel_takes_the_same_steps():
 
 
 def lowered_for_cuda(model: mjx.Model, data: mjx.Data) -> str:
-    """The program of a control step for NVIDIA GPUs, without one."""
+    """Return the program of a control step, lowered for NVIDIA GPUs without one."""
 
     def control_step(data):
         with tracing_for("cuda"), kernels(True):

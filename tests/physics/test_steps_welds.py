@@ -94,7 +94,7 @@ def odd_states(mj_model: mujoco.MjModel, count: int) -> mjx.Data:
 
 @functools.cache
 def by_matrices(name: str):
-    """The task, and its physics steps as they are without kernels: one program for any number of them."""
+    """Return the task, and its physics steps without kernels: one program for any number of them."""
     env = environments.make(name)
 
     def steps_of(data, count):

@@ -1,4 +1,4 @@
-"""What somebody else's files and names must not do: each case once ended the program, filled the memory, or went by untold."""
+"""Files and names from outside that once ended the program, filled the memory or went unreported."""
 
 import csv
 import json

@@ -1,7 +1,7 @@
-"""Law of all readers of files from outside: whatever the bytes, a value or one line of an error of one's own, soon, in 200 MB.
+"""Every reader of external files returns a value or raises its own one-line error, for any bytes, in 1 s of CPU and 200 MB.
 
-Valid files are spoilt (`mutations`) and read in another process (`readers_worker`), so that a crash is told as one. Of each
-kind at least a third of the examples come past the parser. `make fuzz` tries many more, and other ones each time.
+Valid files are corrupted (`mutations`) and read in another process (`readers_worker`), so that a crash is reported as one. At
+least a third of the examples of each kind get past the parser. `make fuzz` tries many more, and other ones each time.
 """
 
 import base64
@@ -31,7 +31,10 @@ def worker() -> Iterator[Worker]:
 
 
 def hold(worker: Worker, name: str, files: st.SearchStrategy[Files], refuses: bool = True) -> None:
-    """Asserts the law for many spoilt files, of which a third come past the parser, and some are read and some ``refuses``."""
+    """Check that reader ``name`` reads or refuses corrupted files within the limits of time and memory.
+
+    At least a third must get past the parser, some must be read and, if ``refuses``, some refused.
+    """
     tally: Counter[str] = Counter()
 
     @given(files)
@@ -57,7 +60,7 @@ def written(text: st.SearchStrategy[str]) -> st.SearchStrategy[bytes]:
 
 
 def also_as_text(tree: st.SearchStrategy[str], valid: str) -> st.SearchStrategy[bytes]:
-    """Spoilt trees, and now and then a text that was spoilt as one."""
+    """Return corrupted trees, and now and then a text that was corrupted as text."""
     return st.one_of(written(tree), written(tree), texts(valid))
 
 
@@ -101,7 +104,7 @@ def test_calibrations_of_ros(worker):
 
 
 def _lines(tree, mark: str) -> str:
-    """A table of names and values as programs print it, a line each."""
+    """Return a table of names and values as programs print it, one per line."""
     return "".join(f"{name}{mark}{value}\n" for name, value in tree.items()) if isinstance(tree, dict) else str(tree)
 
 
@@ -391,7 +394,7 @@ def test_disparities(worker):
 # --- weights ---
 @st.composite
 def safetensors(draw: st.DrawFn, arrays: dict[str, np.ndarray], about: dict) -> bytes:
-    """Settings spoilt as a tree; or the header with names, shapes, types and places; or bytes."""
+    """Draw a file with corrupted settings, or a corrupted header (names, shapes, types and offsets), or corrupted bytes."""
     kind = draw(st.sampled_from(("about", "about", "header", "bytes")))
     if kind == "about":
         return save(arrays, {"about": json_text(draw(trees(about, 2)))})

@@ -1,4 +1,4 @@
-"""The law of `test_readers`, for what lies in a run's folder."""
+"""Every reader of files in a run's folder returns a value or raises its own error, like those of `test_readers`."""
 
 import json
 import shutil
@@ -38,7 +38,7 @@ def test_metrics(worker):  # noqa: F811
 
 
 def test_manifests_of_checkpoints(states, saved):  # noqa: F811
-    """A checkpoint whose manifest is spoilt is used where it can be, or left out with a line, or refused in one."""
+    """A checkpoint with a corrupted manifest is used where possible, or left out with a line, or refused with one line."""
     shutil.rmtree(saved / FULL)
     (file,) = [path for path in (saved / LIGHT / "3" / "manifest").iterdir() if "progress" in path.read_text(errors="replace")]
     valid = json.loads(file.read_text())
