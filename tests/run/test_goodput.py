@@ -54,7 +54,7 @@ def test_a_damaged_line_makes_the_goodput_unknown_and_is_kept(tmp_path, damage):
 
 
 def left_after(config, path, iteration: int) -> None:
-    """A run that stops after a report without a word, as if it were killed."""
+    """Abandon a run after the report of ``iteration``, without an end, as if it were killed."""
     trainer = make_fake_trainer(config, path, resume=path.exists())
     for report in trainer.run():
         if report.iteration == iteration:

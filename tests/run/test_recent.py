@@ -1,4 +1,4 @@
-"""The state that is kept for a process that is killed: exact, written once, checked, and never in the way."""
+"""Recent states, which resume a process that was killed: exact, written once, checked, and never an obstacle."""
 
 import errno
 import shutil
@@ -20,7 +20,7 @@ NO_OTHERS = {"full_checkpoint_interval": 0, "checkpoint_interval": 100}
 
 @pytest.fixture(scope="module")
 def states():
-    """Loop states after 1 to 7 iterations of the fake program, by iteration, and its shapes."""
+    """Loop states after 1 to 7 iterations of the fake program, by iteration, and the program's shapes."""
     trainer = make_fake_trainer(small_config(), None)
     loop, states_at = trainer.init(jax.random.key(7)), {}
     for iteration in range(1, 8):
@@ -153,7 +153,7 @@ def left_after(config, path, iteration: int, **options) -> None:
 
 @pytest.fixture
 def always(monkeypatch):
-    """A state after every iteration."""
+    """Keep a state after every iteration."""
     monkeypatch.setattr(recent, "_FRACTION", np.inf)
 
 

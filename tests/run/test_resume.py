@@ -1,4 +1,4 @@
-"""Going on with a run, or not: what is kept, what is refused, what is said."""
+"""Resumption of runs: what is kept, what is refused, and what is reported."""
 
 import errno
 import json
@@ -152,12 +152,12 @@ def test_an_earlier_run_outlives_a_new_one_that_cannot_be(straight, tmp_path):
 
 
 def interrupted(config, path, after: int) -> None:
-    """A run that SIGTERM ends after iteration ``after``, with a light and a full checkpoint."""
+    """End a run by SIGTERM after iteration ``after``, with a light and a full checkpoint."""
     run_until_sigterm(make_fake_trainer(config, path), after)
 
 
 def test_a_stale_full_checkpoint_destroys_nothing(tmp_path, capsys):
-    """The run gets SIGTERM, is resumed to the end, and then for more: the second part's checkpoints and rows stay."""
+    """The run gets SIGTERM, is resumed to its end, and then extended: the second part's checkpoints and rows stay."""
     path, config = tmp_path / "run", small_config(full_checkpoint_interval=0, env_steps=200)
     interrupted(config, path, 2)
     checkpoints = Checkpoints(path / "checkpoints")

@@ -41,7 +41,7 @@ def test_everything_that_a_run_writes_carries_its_id(tmp_path):
 
 
 def test_a_new_run_does_not_go_on_with_an_old_ones_checkpoints(straight, tmp_path, capsys):
-    """The old checkpoints could not be deleted, and the new run is interrupted before it has come as far as they are."""
+    """The old checkpoints could not be deleted, and the new run is interrupted before it reaches their iterations."""
     path = tmp_path / "run"
     run_until_sigterm(make_fake_trainer(small_config(), path), 2)
     for tier in (LIGHT, FULL):  # later than its own
@@ -135,7 +135,7 @@ def test_what_cannot_be_deleted_is_told_before_a_new_run_starts(straight, tmp_pa
 
 
 def moved_at(trainer, iteration: int, act) -> StorageError:
-    """Returns the error of a run that ends because its folder changes after ``iteration``."""
+    """Return the error of a run that ends because ``act`` changes its folder after ``iteration``."""
     with pytest.raises(StorageError) as stopped:
         for report in trainer.run():
             if report.iteration == iteration:
@@ -168,7 +168,7 @@ def test_a_folder_that_is_deleted_is_not_made_again(tmp_path):
 @pytest.mark.parametrize("resume", [False, True])
 @pytest.mark.parametrize("is_moved", [False, True])
 def test_a_folder_that_goes_while_the_run_compiles_is_not_made_again(straight, tmp_path, monkeypatch, resume, is_moved):
-    """The lock went with it: another run could begin in a new one."""
+    """The lock was in the old folder: another run could begin in a new one."""
     path, there = tmp_path / "run", tmp_path / "there"
     if resume:
         shutil.copytree(straight[0], path)

@@ -1,4 +1,4 @@
-"""Programs that an earlier process has traced: found again, equal, and only where nothing has changed."""
+"""Programs that an earlier process has traced: found, equal, and used only if nothing has changed."""
 
 import dataclasses
 import hashlib
@@ -39,7 +39,7 @@ NAMES = ["init", "learn", "play"]
 
 
 class Told(probes.SeenGoWhereTold):
-    """A built-in task, by its module."""
+    """Probe whose module makes it a built-in task."""
 
     __module__ = "jaxrl_vis_envs.tasks.told"
 
@@ -59,7 +59,7 @@ def program():
 
 
 def untraceable(program, *names: str):
-    """The same program, except that functions cannot be traced."""
+    """Return the same program with some functions that cannot be traced."""
 
     def refuse(*arguments):
         raise AssertionError("traced")
@@ -68,7 +68,7 @@ def untraceable(program, *names: str):
 
 
 def results(made: Programs) -> list[np.ndarray]:
-    """All that two iterations and an evaluation return."""
+    """Return all arrays that two iterations and an evaluation return."""
     loop, first = made.train_iteration(made.init(made.run_keys))
     loop, second = made.train_iteration(loop)
     leaves = jax.tree.leaves((loop.replace(key=jax.random.key_data(loop.key)), first, second, made.evaluate(loop.train)))
@@ -231,7 +231,7 @@ def test_commands_cache_programs_and_scripts_do_not(tmp_path, monkeypatch, capsy
 
 @pytest.fixture
 def kept(folder) -> trace_cache.TraceCache:
-    """A program that was kept, without any of JAX."""
+    """Cache that holds a program, which is a few bytes and not one of JAX."""
     made = trace_cache.TraceCache(folder, "0" * 64)
     made._fresh["play"] = b"a program"
     made.write()

@@ -1,4 +1,4 @@
-"""Figure ``goals``: its runs are what they are called, and its table is that of runs that were made up."""
+"""Figure ``goals``: its runs have the settings that they are named after, and its table is that of invented runs."""
 
 import csv
 import json

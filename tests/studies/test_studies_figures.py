@@ -1,4 +1,4 @@
-"""Figures 5.4 to 5.7 and their tables, from runs that were made up, and once from runs that were trained."""
+"""Figures 5.4 to 5.7 and their tables, from invented runs, and once from trained ones."""
 
 import csv
 import dataclasses
@@ -30,7 +30,7 @@ EVERY = 20_000
 
 
 def made_up(cell: Cell, runs: Path, success: Callable[[int], float], every: int = EVERY, **extra) -> None:
-    """A finished run whose seeds differ by a hundredth."""
+    """Write a finished run whose seeds differ by a hundredth."""
     folder = runs / cell.name
     folder.mkdir(parents=True)
     record = {
@@ -100,7 +100,7 @@ def test_every_variant_can_be_made_with_every_preset(preset: str) -> None:
 
 
 def test_families_keep_configurations_apart() -> None:
-    """Two cells of one name are one cell."""
+    """Cells of the same name have the same configuration."""
     cells_by_name: dict[str, Cell] = {}
     for preset in ("paper", "fast"):
         for options in ((), ("view=fingertips",), ("view=fingertips", "tip_marks=faint")):
@@ -138,7 +138,7 @@ def test_differences_of_curves_are_taken_where_both_are_known() -> None:
 
 
 def line(values: list[list[float]], task: str = FETCH, variant: str = "ol_aux_5") -> Line:
-    """Evaluations every 20 k steps; values are [S][P]."""
+    """Return a line with evaluations every 20 k steps; ``values`` are [S][P]."""
     rows = [
         {"seed": seed, "env_steps": EVERY * place, "updates": 200 * place, "eval/success": value}
         for seed, row in enumerate(values)
@@ -289,7 +289,7 @@ def test_rewards_with_and_without_ground_truth_are_compared(tmp_path: Path, caps
 
 
 def test_panels_say_no_more_about_an_inactive_filter_than_tables(tmp_path: Path) -> None:
-    """A single negative that was dropped and false once was a dot at 100 %, beside a table that gave no precision."""
+    """Regression test: one dropped negative, which was false, was a dot at 100 %, although the table gave no precision."""
     study = indicator.STUDIES["5.2"]
     variant = "indicator_balance_filter"
     ((cell,),) = make_cells(study, ("VisualSawyerReach",), (variant,), Scope("fast")).values()

@@ -1,4 +1,4 @@
-"""Gradients of weighted losses, and their dot products: all ways to find them against each other and finite differences."""
+"""Gradients of weighted losses and their dot products: all modes, compared with each other and with finite differences."""
 
 import functools
 from typing import Any
@@ -114,7 +114,7 @@ def encode_part(encoder: Any, batch: Any, part: slice) -> Any:
 
 
 def losses_of_halves(params: Any, latents: Any, batch: Any) -> dict[str, Any]:
-    """main reads the first half, near the second one, far both; of the first, main also reads what has no gradient."""
+    """Compute losses: main reads the first half, near the second, far both; main also reads the second without a gradient."""
     heads, first, second = params["heads"], latents["first"], latents["second"]
     still = jax.lax.stop_gradient(jnp.mean(second))
     return {
