@@ -79,9 +79,9 @@ ROS = {"image_width": 640, "image_height": 480, "projection_matrix": {"rows": 3,
 
 
 def test_calibrations_of_opencv(worker):
-    spoilt = st.sampled_from((OPENCV, PLAIN)).flatmap(trees)
-    as_yaml = also_as_text(spoilt.map(lambda tree: "%YAML:1.0\n---\n" + yaml_text(tree)), "%YAML:1.0\n" + yaml_text(OPENCV))
-    as_json = also_as_text(spoilt.map(json_text), json_text(OPENCV))
+    corrupted = st.sampled_from((OPENCV, PLAIN)).flatmap(trees)
+    as_yaml = also_as_text(corrupted.map(lambda tree: "%YAML:1.0\n---\n" + yaml_text(tree)), "%YAML:1.0\n" + yaml_text(OPENCV))
+    as_json = also_as_text(corrupted.map(json_text), json_text(OPENCV))
     as_xml = also_as_text(trees(OPENCV).map(_opencv_xml), '<?xml version="1.0"?>\n' + _opencv_xml(OPENCV))
     hold(worker, "calibration", st.one_of(named("rig.yaml", as_yaml), named("rig.json", as_json), named("rig.xml", as_xml)))
 
@@ -181,14 +181,14 @@ COCO = {
 def test_boxes_and_outlines_of_coco(worker):
     single = {**COCO, "annotations": [{"image_id": 1, "bbox": [10, 10, 16, 30]}]}
     outlined = {**COCO, "annotations": [{"image_id": 1, "segmentation": [[10, 10, 26, 10, 20, 40, 12, 40]]}]}
-    spoilt = st.sampled_from((COCO, single, outlined)).flatmap(trees).map(json_text)
-    hold(worker, "coco", named("annotations.json", also_as_text(spoilt, json_text(COCO))))
+    corrupted = st.sampled_from((COCO, single, outlined)).flatmap(trees).map(json_text)
+    hold(worker, "coco", named("annotations.json", also_as_text(corrupted, json_text(COCO))))
 
 
 def test_masks_of_coco(worker):
     each = [{**COCO, "annotations": [annotation]} for annotation in COCO["annotations"][1:]]
-    spoilt = st.sampled_from(each).flatmap(lambda data: st.tuples(st.just(data), trees(data["annotations"], 2)))
-    changed = spoilt.map(lambda both: json_text({**both[0], "annotations": both[1]}))
+    corrupted = st.sampled_from(each).flatmap(lambda data: st.tuples(st.just(data), trees(data["annotations"], 2)))
+    changed = corrupted.map(lambda both: json_text({**both[0], "annotations": both[1]}))
     hold(worker, "coco", named("annotations.json", also_as_text(changed, json_text(each[0]))))
 
 
@@ -208,8 +208,8 @@ def test_annotations_of_pascal_voc(worker):
             head.format
         )
     )
-    spoilt = st.tuples(declare_shapes, trees(VOC).map(lambda tree: xml_text(tree, "annotation"))).map("".join)
-    hold(worker, "voc", named("a.xml", also_as_text(spoilt, text)))
+    corrupted = st.tuples(declare_shapes, trees(VOC).map(lambda tree: xml_text(tree, "annotation"))).map("".join)
+    hold(worker, "voc", named("a.xml", also_as_text(corrupted, text)))
 
 
 LABELME = {
@@ -330,7 +330,7 @@ def _disparities() -> dict[str, bytes]:
     return {name: cv2.imencode(name[1:], values.astype(kind))[1].tobytes() for name, kind in kinds.items()}
 
 
-def _spoilt_images(valid: dict[str, bytes]) -> st.SearchStrategy[Files]:
+def _corrupted_images(valid: dict[str, bytes]) -> st.SearchStrategy[Files]:
     return st.one_of(
         named(name, pngs(data) | blobs(data, 33) if name.endswith(".png") else blobs(data, 64)) for name, data in valid.items()
     )
@@ -341,8 +341,8 @@ def test_images(worker):
     right = st.sampled_from(
         (b"", valid["a.png"], valid["a.jpg"], valid["a16.png"], cv2.imencode(".png", np.zeros((5, 5)))[1].tobytes())
     )
-    both = st.tuples(_spoilt_images(valid), right).map(lambda two: {**two[0], "right.png": two[1]})
-    hold(worker, "image", _spoilt_images(valid) | both)
+    both = st.tuples(_corrupted_images(valid), right).map(lambda two: {**two[0], "right.png": two[1]})
+    hold(worker, "image", _corrupted_images(valid) | both)
 
 
 _WORDS = (
@@ -388,7 +388,7 @@ def test_names_of_images(worker):
 
 
 def test_disparities(worker):
-    hold(worker, "disparity", _spoilt_images(_disparities()))
+    hold(worker, "disparity", _corrupted_images(_disparities()))
 
 
 # --- weights ---
@@ -446,8 +446,9 @@ def test_families(worker):
         "layout": {"stalks_mean": 5, "plot_length": 0.5},
         "stalks": {"lean_sd": [0, 3.5]},
     }
-    spoilt = st.sampled_from((whole, few, few)).flatmap(trees)
-    as_json, as_toml = also_as_text(spoilt.map(json_text), json_text(few)), also_as_text(spoilt.map(toml_text), toml_text(few))
+    corrupted = st.sampled_from((whole, few, few)).flatmap(trees)
+    as_json = also_as_text(corrupted.map(json_text), json_text(few))
+    as_toml = also_as_text(corrupted.map(toml_text), toml_text(few))
     hold(worker, "family", named("mine.json", as_json) | named("mine.toml", as_toml))
 
 

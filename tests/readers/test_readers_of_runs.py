@@ -20,8 +20,8 @@ def test_configurations(worker, tmp_path):  # noqa: F811
     folder = RunFolder(tmp_path / "run")
     folder.open(Config(), log=("tensorboard",))
     valid = json.loads(folder.config.read_text())
-    spoilt = trees(valid, 2) | trees(valid["config"], 2).map(lambda config: {**valid, "config": config})
-    hold(worker, "config", named("config.json", also_as_text(spoilt.map(json_text), json_text(valid))))
+    corrupted = trees(valid, 2) | trees(valid["config"], 2).map(lambda config: {**valid, "config": config})
+    hold(worker, "config", named("config.json", also_as_text(corrupted.map(json_text), json_text(valid))))
 
 
 ROWS = [

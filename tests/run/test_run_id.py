@@ -322,9 +322,9 @@ def test_a_row_whose_id_has_a_wrong_bit_is_put_aside(straight, tmp_path, capsys)
     *lines, last = file.read_text().splitlines(keepends=True)
     run_id = read_run_id(path)
     assert run_id is not None and run_id in last
-    spoilt = last.replace(run_id, ("1" if run_id[0] == "0" else "0") + run_id[1:])
-    file.write_text("".join([*lines, spoilt]))
+    corrupted = last.replace(run_id, ("1" if run_id[0] == "0" else "0") + run_id[1:])
+    file.write_text("".join([*lines, corrupted]))
     list(make_fake_trainer(small_config(), path, resume=True).run())
     assert "metrics.jsonl held 1 row of another run: kept in" in capsys.readouterr().out
-    assert (path / "checkpoints" / "foreign" / "metrics.jsonl").read_text() == spoilt
+    assert (path / "checkpoints" / "foreign" / "metrics.jsonl").read_text() == corrupted
     assert rows_without_time(path)[-2:] == rows_without_time(straight[0])[-2:]

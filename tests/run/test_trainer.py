@@ -68,7 +68,7 @@ def test_a_replay_that_cannot_fit_is_refused_before_allocation(tmp_path, monkeyp
 
 
 def test_an_evaluation_begins_early_only_where_there_is_room(straight, tmp_path, monkeypatch):
-    """An early evaluation begins before the host has read the last iteration's results, and computes the same as a later one."""
+    """An early evaluation begins before the host has read the last iteration's results, and gives the same as a later one."""
     run_dir, made, _ = straight
     compiled = made.programs.compile()
     state, scratch = memory._sizes(compiled)
