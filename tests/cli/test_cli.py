@@ -42,7 +42,7 @@ HELP = [[], ["phenotype"], *(name.split() for name in cli.all_commands())]
 
 
 @pytest.fixture(scope="module")
-def helped() -> list[tuple[list[str], str]]:
+def help_outputs() -> list[tuple[list[str], str]]:
     """Heavy packages imported after each command of `HELP`, and its output; all run in one process."""
     code = f"""
 import contextlib, io, json, sys
@@ -64,8 +64,8 @@ print(json.dumps(found))
 
 
 @pytest.mark.parametrize("index", range(len(HELP)), ids=lambda index: " ".join(HELP[index]) or "jaxrl-vis")
-def test_help_imports_nothing_heavy(index: int, helped: list[tuple[list[str], str]]) -> None:
-    heavy, printed = helped[index]
+def test_help_imports_nothing_heavy(index: int, help_outputs: list[tuple[list[str], str]]) -> None:
+    heavy, printed = help_outputs[index]
     assert not heavy
     assert "usage: jaxrl-vis" in printed
 
@@ -413,7 +413,7 @@ def test_doctor_reports_what_fails(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     assert "ok    versions" in output
 
 
-def test_a_reader_that_has_seen_enough_is_no_error() -> None:
+def test_a_reader_that_closes_its_pipe_is_not_an_error() -> None:
     command = [sys.executable, "-m", "jaxrl_vis", "train", "--help"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None and program.stderr is not None

@@ -82,7 +82,7 @@ def start(run_dir: Path, count: int, devices: int, *options: str) -> list[subpro
     ]
 
 
-def ended(processes: Sequence[subprocess.Popen], seconds: float = 120.0) -> list[tuple[int, str, str]]:
+def wait_for_processes(processes: Sequence[subprocess.Popen], seconds: float = 120.0) -> list[tuple[int, str, str]]:
     """Wait for processes to end, for at most ``seconds`` each, and return the exit status and output of each."""
     try:
         outputs = [process.communicate(timeout=seconds) for process in processes]
@@ -103,10 +103,10 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list, list, fl
     processes = start(run_dir, 2, 1, "die_at=3")
     processes[1].wait(200)
     died = time.monotonic()
-    ends = ended(processes)
+    ends = wait_for_processes(processes)
     seconds = time.monotonic() - died
     assert Checkpoints(run_dir / "checkpoints", read_only=True).newest() == 2
-    return run_dir, ends, ended(start(run_dir, 2, 1, "resume=1")), seconds
+    return run_dir, ends, wait_for_processes(start(run_dir, 2, 1, "resume=1")), seconds
 
 
 def test_a_process_that_dies_ends_the_others_and_leaves_the_checkpoint(pair: tuple[Path, list, list, float]) -> None:
@@ -120,7 +120,7 @@ def test_a_process_that_dies_ends_the_others_and_leaves_the_checkpoint(pair: tup
 
 def test_two_processes_learn_and_save_what_one_does(pair: tuple[Path, list, list, float], tmp_path: Path) -> None:
     run_dir, *_ = pair
-    ((status, _, words),) = ended(start(tmp_path / "one", 1, 2))
+    ((status, _, words),) = wait_for_processes(start(tmp_path / "one", 1, 2))
     assert status == 0, words
     for ours, theirs in zip(rows_without_time(run_dir), rows_without_time(tmp_path / "one"), strict=True):
         assert ours == pytest.approx(theirs, abs=1e-5, nan_ok=True)
@@ -138,7 +138,7 @@ def two_trainings(*words: str) -> list[tuple[int, str, str]]:
     train = [sys.executable, "-m", "jaxrl_vis", "train", *words, "--preset", "debug", "--env-steps", "40"]
     place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", "2", "--process-id"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return ended([subprocess.Popen([*train, *place, index], **pipes) for index in ("0", "1")], 200)
+    return wait_for_processes([subprocess.Popen([*train, *place, index], **pipes) for index in ("0", "1")], 200)
 
 
 def test_processes_train_a_task_with_physics(tmp_path: Path) -> None:
@@ -172,7 +172,7 @@ def test_a_signal_to_one_process_saves_and_ends_all(tmp_path: Path) -> None:
     while not second.readline().startswith("report"):
         assert processes[1].poll() is None
     processes[1].send_signal(signal.SIGUSR2)
-    ends = ended(processes)
+    ends = wait_for_processes(processes)
     assert [status for status, _, _ in ends] == [128 + signal.SIGUSR2] * 2, ends
     assert "SIGUSR2: saving" in ends[0][1]
     checkpoints = Checkpoints(tmp_path / "run" / "checkpoints", read_only=True)

@@ -199,7 +199,7 @@ def test_environments_are_made_without_a_stdout(kind, monkeypatch):
     let_go(stream)
 
 
-def test_what_is_no_fault_of_the_disk_is_not_told_as_one(tmp_path, monkeypatch):
+def test_other_faults_are_not_reported_as_faults_of_the_disk(tmp_path, monkeypatch):
     trainer = make_fake_trainer(small_config(), tmp_path / "run")
 
     def broken(*_):

@@ -143,7 +143,7 @@ def test_processes_end_with_the_one_that_started_them_however_that_ends(tmp_path
         started.kill()
         started.wait()
     workers = [int(path.read_text()) for path in tmp_path.glob("*.pid")]
-    wait_until(lambda: not any(runs(worker) for worker in workers), 10.0)
+    wait_until(lambda: not any(is_running(worker) for worker in workers), 10.0)
 
 
 def wait_until(holds: Callable[[], bool], seconds: float) -> None:
@@ -153,7 +153,7 @@ def wait_until(holds: Callable[[], bool], seconds: float) -> None:
         time.sleep(0.05)
 
 
-def runs(process: int) -> bool:
+def is_running(process: int) -> bool:
     """Return True if a process is running; an ended one may still be listed."""
     try:
         os.kill(process, 0)

@@ -106,7 +106,7 @@ def learner(mode=None, **overrides):
     return algorithm, update, algorithm.begin(start, Statistics(normalizer.init(SPEC), None)), batch
 
 
-def sizes(tree):
+def magnitudes(tree):
     """Return the root mean square of each part, averaged over its leaves."""
     return {
         name: float(np.sqrt(np.mean([np.mean(np.square(x)) for x in jax.tree.leaves(part)]))) for name, part in tree.items()
@@ -118,7 +118,7 @@ def test_every_auxiliary_loss_is_learned_and_reaches_both_encoders():
     _, gradients, first = update(working, batch)
     for network in (gradients.critic, gradients.actor):
         assert set(network) == {"encoder", "head", "heads"} and set(network["heads"]) == set(ALL)
-        assert all(size > 0 for size in sizes(network).values()) and all(size > 0 for size in sizes(network["heads"]).values())
+        assert all(size > 0 for size in magnitudes(network).values()) and all(size > 0 for size in magnitudes(network["heads"]).values())
     for _ in range(60):
         working, _, last = update(working, batch)
     for name in ALL:
@@ -192,13 +192,13 @@ def test_heads_of_both_networks_learn_while_their_losses_are_kept_out_of_the_enc
     for found, one in ((always.critic, ones.critic), (always.actor, ones.actor)):
         for left, right in zip(jax.tree.leaves(found["heads"]), jax.tree.leaves(one["heads"]), strict=True):
             np.testing.assert_allclose(left, right, rtol=1e-4, atol=1e-6)
-        assert sizes(found["heads"])["inverse_dynamics"] > 0
+        assert magnitudes(found["heads"])["inverse_dynamics"] > 0
     _, update, start, _ = learner(mode, **tasks, weighting="ol_aux")
     _, weighted, _ = update(start._replace(agent=start.agent.replace(weighting=state)), batch)
     for found, one in ((always.critic, weighted.critic), (always.actor, weighted.actor)):
         for left, right in zip(jax.tree.leaves(found["encoder"]), jax.tree.leaves(one["encoder"]), strict=True):
             np.testing.assert_allclose(left, right, rtol=1e-4, atol=1e-6)
-        assert sizes(one["heads"])["inverse_dynamics"] == 0
+        assert magnitudes(one["heads"])["inverse_dynamics"] == 0
 
 
 def test_the_ablation_compares_gradients_of_held_parameters():
@@ -274,7 +274,7 @@ def test_a_weighting_of_any_kind_trains_both_networks(weighting):
     for _ in range(2):
         before, (working, gradients, metrics) = working, update(working, batch)
     for network in (gradients.critic, gradients.actor):
-        assert all(size > 0 for size in sizes(network).values()) and all(np.isfinite(list(sizes(network).values())))
+        assert all(size > 0 for size in magnitudes(network).values()) and all(np.isfinite(list(magnitudes(network).values())))
     assert all(np.isfinite(value).all() for value in jax.tree.leaves(metrics))
     assert {f"train/weight/{name}" for name in ("main", *TWO)} <= set(metrics)
     assert jax.tree.structure(before.agent.weighting) == jax.tree.structure(working.agent.weighting)
@@ -305,7 +305,7 @@ def test_a_main_loss_that_is_like_the_others_is_weighted_in_both_networks():
         for network in ("critic", "actor"):
             one, other = (getattr(found[name], network)[part] for name in ("sum", "mgda"))
             jax.tree.map(assert_same, one, other)
-    assert sizes(found["mgda"].actor)["encoder"] < sizes(found["sum"].actor)["encoder"]
+    assert magnitudes(found["mgda"].actor)["encoder"] < magnitudes(found["sum"].actor)["encoder"]
 
 
 def test_learners_draw_apart():

@@ -146,7 +146,7 @@ def test_bfloat16_decodes_nearly_what_float32_does():
     assert 1e-4 < np.linalg.norm(found - expected) / np.linalg.norm(expected) < 2e-2
 
 
-def declared(task):
+def declared_fields(task):
     """Return the names of the optional fields of a view that a task declares."""
     own = {"latent_view": task.view, "target": task.view or task.target}
     return {*task.needs, *(field for field, maker in own.items() if maker is not None)}
@@ -157,7 +157,7 @@ def test_what_a_task_does_not_declare_may_be_left_out():
     everything = jax.eval_shape(lambda: make_views(spec, 2))
     for name, task in auxtasks.make(auxtasks.NAMES, spec).items():
         params = jax.eval_shape(task.init, jax.random.key(0))
-        fields = {field: getattr(everything[name], field) for field in declared(task)}
+        fields = {field: getattr(everything[name], field) for field in declared_fields(task)}
         bare = auxtasks.View(everything[name].latent_t, everything[name].action)
         assert jax.eval_shape(task.loss, params, bare.replace(**fields)).shape == ()
         for field in fields:

@@ -137,7 +137,7 @@ def arithmetic_of(numpy: Any) -> Iterator[None]:
         yield
 
 
-def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: Any = True) -> steps.JointState:
+def simulate_in_numpy(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: Any = True) -> steps.JointState:
     """Return the states [B, N] of a batch after `steps.simulate` in NumPy."""
     constants = scalar_model.build_scalar_model(model)
     used = list(constants.mocaps)
@@ -199,7 +199,7 @@ def test_a_step_of_each_task_is_that_of_matrices(name):
     after = one_step(data)
     touching = (np.asarray(after._impl.contact.dist) < 0).sum(axis=1)
     assert (touching == 0).sum() > 5 and (touching > 0).sum() > 2
-    state = taken(env._model, data, 1, in_kernel=True)
+    state = simulate_in_numpy(env._model, data, 1, in_kernel=True)
     assert state.acceleration.dtype == np.float32
     # Rounding errors of float32, 1e-7 of what cancels, times the condition of the mass matrix and of stiff contacts.
     scale = np.abs(np.asarray(after.qacc)).max(axis=1)
@@ -214,7 +214,7 @@ def test_a_control_step_of_each_task_is_that_of_matrices(name):
     data = states(name)
     env, _ = by_matrices(name, 1)
     _, control_step = by_matrices(name, env.config.substeps)
-    after, state = control_step(data), taken(env._model, data, env.config.substeps, in_kernel=False)
+    after, state = control_step(data), simulate_in_numpy(env._model, data, env.config.substeps, in_kernel=False)
     error = np.abs(state.position - np.asarray(after.qpos)).max(axis=1)
     # A contact that begins one step later changes more than rounding errors do.
     assert np.median(error) < 2e-6 and error.max() < 1e-3, np.sort(error)[-5:]
@@ -261,7 +261,7 @@ def test_a_step_of_a_model_with_everything(warmstart):
     after = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.step(model, data, True)))(data)
     contact = np.asarray(after._impl.contact.dist) - np.asarray(after._impl.contact.includemargin)
     assert ((contact < 0).sum(axis=0) > 10).all() and ((contact < 0).sum(axis=1) > 1).sum() > 10
-    state = taken(model, data, 1, in_kernel=warmstart == "disable")
+    state = simulate_in_numpy(model, data, 1, in_kernel=warmstart == "disable")
     scale = np.abs(np.asarray(after.qacc)).max(axis=1)
     error = np.abs(state.acceleration - np.asarray(after.qacc)).max(axis=1) / scale
     assert np.median(error) < 2e-6 and error.max() < 1e-3, np.sort(error)[-10:]
@@ -336,7 +336,7 @@ def test_the_kernel_of_runge_kutta_takes_the_steps_of_mjx():
         np.testing.assert_allclose(getattr(ours, name), getattr(after, name), rtol=1e-3, atol=1e-2)
     # One step, also beside MJX's own.
     theirs = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx.step(env._model, data)))(data)
-    ours = taken(env._model, data, 1, in_kernel=True, exact=False)
+    ours = simulate_in_numpy(env._model, data, 1, in_kernel=True, exact=False)
     np.testing.assert_allclose(ours.position, theirs.qpos, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(ours.velocity, theirs.qvel, rtol=1e-5, atol=1e-5)
 
@@ -364,7 +364,7 @@ def test_joints_without_constraints_beside_others(integrator):
 def test_whether_steps_are_exact_may_be_a_number(is_exact):
     mj_model = odd_model()
     model, data = mjx.put_model(mj_model), odd_states(mj_model, 50)
-    known, read = (taken(model, data, 2, in_kernel=True, exact=exact) for exact in (is_exact, np.int32(is_exact)))
+    known, read = (simulate_in_numpy(model, data, 2, in_kernel=True, exact=exact) for exact in (is_exact, np.int32(is_exact)))
     for one, other in zip(known, read, strict=True):
         np.testing.assert_array_equal(one, other)
 

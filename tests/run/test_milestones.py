@@ -189,7 +189,7 @@ def test_a_run_killed_at_its_early_end_ends_there(straight: Path, make: Callable
     assert {row["iteration"] for row in rows_without_time(path)} == {2, PEAK} and best(path) == [PEAK]
 
 
-def test_a_level_that_is_no_success_is_refused() -> None:
+def test_a_level_that_is_not_a_success_rate_is_refused() -> None:
     with pytest.raises(RequestError, match="stop_at 95 can never be reached: success is from 0 to 1"):
         validate(small_config(stop_at=95.0))
     with pytest.raises(RequestError, match="best_by"):

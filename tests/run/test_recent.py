@@ -145,7 +145,7 @@ def test_no_room_is_said_once_and_ends_nothing(states, tmp_path, monkeypatch):
     assert not (tmp_path / RECENT).exists()
 
 
-def left_after(config, path, iteration: int, **options) -> None:
+def abandon_run(config, path, iteration: int, **options) -> None:
     for report in make_fake_trainer(config, path, resume=path.exists(), **options).run():
         if report.iteration == iteration:
             return
@@ -160,7 +160,7 @@ def always(monkeypatch):
 @pytest.mark.parametrize("after", [1, 3, 4, 7])
 def test_a_run_that_is_killed_goes_on_exactly(straight, tmp_path, always, capsys, after):
     path, config = tmp_path / "run", small_config(**NO_OTHERS)
-    left_after(config, path, after)
+    abandon_run(config, path, after)
     assert Checkpoints(path / "checkpoints").iterations(RECENT)[-1] in (after, after + 1)
     list(make_fake_trainer(config, path, resume=True).run())
     out = capsys.readouterr().out
@@ -172,7 +172,7 @@ def test_a_run_that_is_killed_goes_on_exactly(straight, tmp_path, always, capsys
 def test_a_run_that_is_killed_again_and_again_goes_on_exactly(straight, tmp_path, always):
     path, config = tmp_path / "run", small_config(**NO_OTHERS)
     for after in (2, 4, 5, 7):
-        left_after(config, path, after)
+        abandon_run(config, path, after)
     list(make_fake_trainer(config, path, resume=True).run())
     assert rows_without_time(path) == rows_without_time(straight[0])
 
@@ -195,7 +195,7 @@ def test_killed_in_an_evaluation_it_is_evaluated_again(straight, tmp_path, alway
 
 def test_a_damaged_one_is_kept_and_the_one_before_is_used(straight, tmp_path, always, capsys):
     path, config = tmp_path / "run", small_config(**NO_OTHERS)
-    left_after(config, path, 5)
+    abandon_run(config, path, 5)
     newest = Checkpoints(path / "checkpoints").iterations(RECENT)[-1]
     flip(path / "checkpoints" / RECENT / f"{newest}.state", -1)
     list(make_fake_trainer(config, path, resume=True).run())
@@ -208,14 +208,14 @@ def test_a_damaged_one_is_kept_and_the_one_before_is_used(straight, tmp_path, al
 def test_a_light_checkpoint_is_never_newer(tmp_path, monkeypatch):
     monkeypatch.setattr(recent, "_FRACTION", 1e-9)  # next to never by the clock
     path, config = tmp_path / "run", small_config(full_checkpoint_interval=0)
-    left_after(config, path, 5)
+    abandon_run(config, path, 5)
     checkpoints = Checkpoints(path / "checkpoints")
     assert checkpoints.iterations(RECENT)[-1] == checkpoints.iterations(LIGHT)[-1] == 4
 
 
 def test_a_full_checkpoint_takes_its_place(straight, tmp_path, always):
     path, config = tmp_path / "run", small_config(**NO_OTHERS)
-    left_after(config, path, 3)
+    abandon_run(config, path, 3)
     list(make_fake_trainer(config.replace(full_checkpoint_interval=3), path, resume=True).run())
     assert Checkpoints(path / "checkpoints").iterations(FULL) == [6, 8] and not (path / "checkpoints" / RECENT).exists()
     assert rows_without_time(path) == rows_without_time(straight[0])

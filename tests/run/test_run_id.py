@@ -134,7 +134,7 @@ def test_what_cannot_be_deleted_is_told_before_a_new_run_starts(straight, tmp_pa
     assert list(make_fake_trainer(small_config(env_steps=100), path, resume=True).run())[0].iteration == 9
 
 
-def moved_at(trainer, iteration: int, act) -> StorageError:
+def error_of_moved_run(trainer, iteration: int, act) -> StorageError:
     """Return the error of a run that ends because ``act`` changes its folder after ``iteration``."""
     with pytest.raises(StorageError) as stopped:
         for report in trainer.run():
@@ -148,7 +148,7 @@ def moved_at(trainer, iteration: int, act) -> StorageError:
 def test_a_folder_that_is_moved_is_told_where_it_is_and_goes_on_there(straight, tmp_path):
     old, new = tmp_path / "old", tmp_path / "new"
     config = small_config(full_checkpoint_interval=4, checkpoint_interval=4)
-    error = moved_at(make_fake_trainer(config, old), 5, lambda: old.rename(new))
+    error = error_of_moved_run(make_fake_trainer(config, old), 5, lambda: old.rename(new))
     assert f"{old} was moved to {new}" in str(error) and f"go on with --run-dir {new} --resume" in str(error)
     assert not old.exists()  # nothing that would look like a run
     list(make_fake_trainer(config, new, resume=True).run())
@@ -160,7 +160,7 @@ def test_a_folder_that_is_moved_is_told_where_it_is_and_goes_on_there(straight, 
 
 def test_a_folder_that_is_deleted_is_not_made_again(tmp_path):
     path = tmp_path / "run"
-    error = moved_at(make_fake_trainer(small_config(), path), 3, lambda: shutil.rmtree(path))
+    error = error_of_moved_run(make_fake_trainer(small_config(), path), 3, lambda: shutil.rmtree(path))
     assert f"{path} is gone" in str(error) and "make room" not in str(error)
     assert not path.exists()
 
@@ -212,7 +212,7 @@ def test_what_a_save_makes_again_of_a_deleted_folder_is_deleted_too(tmp_path, ot
             (path / other).parent.mkdir(exist_ok=True)
             (path / other).touch()
 
-    assert "is gone" in str(moved_at(make_fake_trainer(small_config(), path), 3, delete))
+    assert "is gone" in str(error_of_moved_run(make_fake_trainer(small_config(), path), 3, delete))
     assert path.exists() == (other is not None) and (other is None or (path / other).exists())
 
 
@@ -230,7 +230,7 @@ def test_a_new_folder_of_the_same_name_is_left_alone(tmp_path):
         path.mkdir()
         (path / "notes.txt").write_text("mine")
 
-    assert "was moved to" in str(moved_at(make_fake_trainer(small_config(), path), 3, replace)) or os.name != "posix"
+    assert "was moved to" in str(error_of_moved_run(make_fake_trainer(small_config(), path), 3, replace)) or os.name != "posix"
     assert [entry.name for entry in path.iterdir()] == ["notes.txt"]
 
 

@@ -128,7 +128,7 @@ def test_whoever_has_trained_a_run_is_not_asked(here, cache, monkeypatch):
     assert not trust.is_trusted(run, config.replace(env_folder=str(run)))
 
 
-def test_a_cache_that_cannot_be_written_is_no_hindrance(stranger, cache):
+def test_a_cache_that_cannot_be_written_is_not_an_obstacle(stranger, cache):
     cache.parent.parent.mkdir()
     cache.parent.write_text("a file")
     config = read_config(stranger)

@@ -267,7 +267,7 @@ def test_widths_without_ground_say_so(plots, tmp_path, capsys):
     assert "mm thick, no visible ground" in page and "thick at 12 inches" not in page
 
 
-def test_nothing_seen_is_no_count(plots, tmp_path, capsys):
+def test_nothing_seen_gives_no_count(plots, tmp_path, capsys):
     """The plot may be empty, or its camera may be unfamiliar to the networks."""
     plot = tmp_path / "plot_0000"
     shutil.copytree(plots / "plot_0000", plot)

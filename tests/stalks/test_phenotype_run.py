@@ -182,7 +182,7 @@ def test_wrong_requests_of_figures(tmp_path, monkeypatch, capsys, words, part):
     assert part in capsys.readouterr().err
 
 
-def test_what_is_no_evaluation(tmp_path, capsys):
+def test_what_is_not_an_evaluation(tmp_path, capsys):
     path = tmp_path / "eval.json"
     for text in ("", "{}", '{"synthetic": true, "each": [{}]}'):
         path.write_text(text)

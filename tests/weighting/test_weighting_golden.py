@@ -357,7 +357,7 @@ def explicit_gramian(params: Any, batch: Any) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def spying(seen: list[Any]) -> Iterator[jw.Weighting]:
+def recording_weighting(seen: list[Any]) -> Iterator[jw.Weighting]:
     """Yield a weighting that needs a Gramian, and appends each one that it receives to ``seen``."""
     inner = jw.uniform()
 
@@ -376,7 +376,7 @@ def test_both_ways_find_the_explicit_gramian() -> None:
         @jax.jit
         def find(params: Any, batch: Any, mode: Any = mode) -> Any:
             seen: list[Any] = []
-            with spying(seen) as weighting:
+            with recording_weighting(seen) as weighting:
                 gradient = jw.weighted_grad(losses_of_latents, weighting, encoder_of, mode, encode=encode)
                 return gradient(params, weighting.init(tuple(params["heads"])), batch), seen[0]
 
@@ -403,7 +403,7 @@ def test_gramians_through_groups_of_latents_and_of_parts_of_a_batch() -> None:
     seen: list[Any] = []
 
     def on_parts(part: Any) -> Any:
-        with spying(seen) as weighting:
+        with recording_weighting(seen) as weighting:
             gradient = jw.weighted_grad(
                 losses, weighting, encoder_of, "latents", encode=groups, reduce=lambda tree: jax.lax.pmean(tree, "devices")
             )
