@@ -118,7 +118,7 @@ def test_every_auxiliary_loss_is_learned_and_reaches_both_encoders():
     _, gradients, first = update(working, batch)
     for network in (gradients.critic, gradients.actor):
         assert set(network) == {"encoder", "head", "heads"} and set(network["heads"]) == set(ALL)
-        assert all(size > 0 for size in magnitudes(network).values()) and all(size > 0 for size in magnitudes(network["heads"]).values())
+        assert all(size > 0 for part in (network, network["heads"]) for size in magnitudes(part).values())
     for _ in range(60):
         working, _, last = update(working, batch)
     for name in ALL:

@@ -61,7 +61,7 @@ def rows(seed: int = 0, count: int = 3) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ALL)
 def test_states_and_metrics_keep_their_structure(name: str) -> None:
-    """A state may be the carry of a scan; one that was saved as NumPy arrays goes on as it would have."""
+    """A state may be the carry of a scan; one that was saved as NumPy arrays continues in the same way."""
     losses = {each: jnp.float32(1.0 + place) for place, each in enumerate(NAMES)}
     gradients = {each: as_tree(row) for each, row in zip(NAMES, rows(), strict=True)}
     first, second = begin(name), None
