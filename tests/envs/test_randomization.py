@@ -64,7 +64,7 @@ def test_off_adds_nothing() -> None:
     assert len(jax.tree.leaves(with_all)) == len(jax.tree.leaves(start)) + len(ALL.active)
     assert sum(leaf.size for leaf in jax.tree.leaves(with_all.domain)) < 200
 
-    # Nor to the program: it is that of an environment which knows of no randomisation.
+    # Nor to the program: it is that of an environment without randomisation.
     class Plain(PointMass):
         def reset(self, key: jax.Array) -> Any:
             data, goal = self.sample_start(key), self.sample_goal(key)

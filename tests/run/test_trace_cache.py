@@ -113,7 +113,7 @@ def test_damaged_and_unsuitable_programs_are_traced_anew(folder, program):
     files["learn"].write_bytes(good["play"])  # whole, but renamed
     Programs(CONFIG, program, keep=True).compile()
     assert {path.name.partition("-")[0]: path.read_bytes() for path in folder.iterdir()} == good
-    data = good["play"][32:]  # of something else, by whoever knows what a digest is of
+    data = good["play"][32:]  # of something else, with a digest that fits
     files["learn"].write_bytes(hashlib.sha256(files["learn"].name.encode() + b"\0" + data).digest() + data)
     unsuitable = Programs(CONFIG, program, keep=True)
     unsuitable.compile()

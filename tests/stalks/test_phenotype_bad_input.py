@@ -181,7 +181,7 @@ def test_synth_adds_the_truth_that_is_missing(plots, tmp_path, capsys):
     assert [path.name for path in sorted((tmp_path / "plot_0000").glob("left_*"))] == ["left_000.png"]
     annotations = json.loads((tmp_path / "plot_0000" / "annotations.json").read_text())["annotations"]
     assert annotations and all("segmentation" in each for each in annotations)
-    # What holds more than is asked for stays.
+    # What holds more than is required stays.
     assert cli.main([*words, "boxes"]) == 0
     assert "1 there already" in capsys.readouterr().out
 

@@ -31,7 +31,7 @@ from jaxrl_vis.studies.engine.grid import run_cells, train_command
 
 CPU = [Device("the CPU", {})]
 
-# A run that evaluates every 100 steps, and writes down how it was started; what else it does is told by one word.
+# A run that evaluates every 100 steps, and records how it was started; one word selects what else it does.
 SCRIPT = """
 import json, os, pathlib, signal, sys, time
 folder, config, behaviour = pathlib.Path(sys.argv[1]), sys.argv[4], sys.argv[5]
