@@ -42,9 +42,7 @@ RED, BLUE = np.array([0.9, 0.1, 0.2]), np.array([0.1, 0.2, 0.9])
 
 
 def load(body: str, floor: str = FLOOR) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Return model and data after forward kinematics of a scene over a grey floor, with a texture whose left half is
-    transparent.
-    """
+    """Load a scene over a grey floor, with a texture whose left half is transparent; return the model and its poses."""
     pixels = np.full((8, 8, 4), [200, 100, 50, 255], np.uint8)
     pixels[:, :4, 3] = 0
     file = io.BytesIO()
