@@ -94,7 +94,7 @@ POSES = {
 
 @functools.cache
 def contacts_of_boxes() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Contacts [K, 7] in each pose, MuJoCo's and ours: position (m), normal, distance (m); in order."""
+    """Return contacts [K, 7] in each pose, MuJoCo's and ours, sorted by position: position (m), normal, distance (m)."""
     mj_model = mujoco.MjModel.from_xml_string(TWO_BOXES)
     mj_data, model = mujoco.MjData(mj_model), mjx.put_model(mj_model)
     still = mjx_model.rest_data(mj_model)

@@ -1,4 +1,4 @@
-"""Images for environments of other libraries, by one call: brax's, stand-ins of others, plain models, Gymnasium's."""
+"""Images for environments of other libraries, by one call: for brax, stand-ins of others, plain models and Gymnasium."""
 
 import dataclasses
 import pickle
@@ -76,7 +76,7 @@ class PlaygroundState:
 
 
 class PlaygroundEnv:
-    """The interface of MuJoCo Playground's `mjx_env.MjxEnv`, as its tasks fill it in: a cart that is pushed."""
+    """Stand-in for MuJoCo Playground's `mjx_env.MjxEnv`, with the members that its tasks define: a cart that is pushed."""
 
     def __init__(self) -> None:
         self._mj_model = mujoco.MjModel.from_xml_string(_XML)
@@ -360,7 +360,7 @@ def test_gymnasium_environments_stay_on_the_host() -> None:
 
 
 class TargetEnv(gymnasium.Env):
-    """A cart that moves the site of its target when it renders, and then computes poses, as Gymnasium-Robotics does."""
+    """Environment of a cart; rendering moves the site of its target and computes poses afterwards, as in Gymnasium-Robotics."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))

@@ -1,4 +1,4 @@
-"""Domain randomisation: active ranges change only what they should, and with all off nothing changes."""
+"""Domain randomisation: active ranges change only what they should; if all are off, nothing changes."""
 
 import functools
 from typing import Any, get_args
@@ -36,7 +36,7 @@ def make(ranges: Randomization, **options: Any) -> PointMass:
 
 @functools.cache
 def episodes(ranges: Randomization = OFF) -> tuple[Any, Any]:
-    """Starts of COUNT episodes, and their state after STEPS full actions."""
+    """Return the starts of COUNT episodes, and their states after STEPS full actions."""
     env = make(ranges)
 
     def play(keys: jax.Array) -> tuple[Any, Any]:

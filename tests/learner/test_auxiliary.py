@@ -34,7 +34,7 @@ def rollout() -> Episodes:
 
 @jax.jit
 def _rollout(key: jax.Array) -> Episodes:
-    """Episodes of a bright spot that actions move over a fixed pattern."""
+    """Return episodes of a bright spot that actions move over a fixed pattern."""
     keys = jax.random.split(key, 3)
     actions = jax.random.uniform(keys[0], (EPISODES, HORIZON, ACTIONS), minval=-1.0, maxval=1.0)
     places = jnp.cumsum(jnp.pad(2.0 * actions, ((0, 0), (1, 1), (0, 0))), axis=1) + 8.0

@@ -13,7 +13,7 @@ rotate = jax.jit(egomotion.rotate, static_argnames="border")
 
 
 def smooth_images(channels=2):
-    """[1, C, SIZE, SIZE] uint8 without sharp edges."""
+    """Return random images [1, C, SIZE, SIZE] uint8 without sharp edges."""
     noise = np.random.default_rng(0).uniform(size=(channels, SIZE, SIZE))
     smooth = scipy.ndimage.gaussian_filter(noise, (0, 2, 2))
     return np.uint8(255 * (smooth - smooth.min()) / np.ptp(smooth))[None]

@@ -13,7 +13,7 @@ HORIZON, ENVS = 5, 3
 
 
 def encoded_rollout(first_episode: int) -> Episodes:
-    """Episodes whose frames, states and actions hold (episode id, slot)."""
+    """Return episodes whose frames, states and actions hold (episode id, slot)."""
     episode = jnp.arange(first_episode, first_episode + ENVS)
     slots = jnp.arange(HORIZON + 2)
     both = jnp.stack(jnp.broadcast_arrays(episode[:, None], slots[None]), axis=-1)  # [E, T+2, 2]

@@ -84,7 +84,7 @@ def step_of(mj_model: mujoco.MjModel, drawn: dict[str, np.ndarray]) -> JointStat
 
 
 def drawn_states(count: int) -> dict[str, np.ndarray]:
-    """States of `BOXES`: the box on the table or up to 1 mm above it, the finger on top of the box or beside it."""
+    """Return states of `BOXES`: the box on the table or up to 1 mm above it, the finger on top of the box or beside it."""
     rng = np.random.default_rng(0)
     mj_model = mujoco.MjModel.from_xml_string(BOXES)
     data, qpos = mujoco.MjData(mj_model), np.empty((count, 9))

@@ -173,7 +173,7 @@ def repeated(data: mjx.Data, count: int) -> mjx.Data:
 
 @functools.cache
 def states(name: str) -> mjx.Data:
-    """48 episodes in the middle of a control step, after three random ones."""
+    """Return the states of 48 episodes in the middle of a control step, after three random ones."""
     env = environments.make(name)
     rng = np.random.default_rng(0)
     actions = jnp.asarray(rng.uniform(-1, 1, (4, 48, env.action_size)), jnp.float32)

@@ -78,7 +78,7 @@ def algorithm_1(start: np.ndarray, steps: int, interval: int, alpha: float, beta
 
 @pytest.mark.parametrize("interval", [1, 5])
 def test_algorithm_1_is_its_transcription(interval: int) -> None:
-    """Both take 1,002 steps, which 5 does not divide, in float64: rounding of float32 would grow along the way."""
+    """Both take 1,002 steps, not a multiple of 5, in float64, because rounding of float32 would grow along the way."""
     start, alpha, beta, eps, steps = np.array([1.8, 1.0]), 0.002, 5.0 * interval, 0.05, 1002
     with jax.enable_x64(True):
         weighting = make_weighting("ol_aux", interval=interval, learning_rate=alpha, beta=beta, eps=eps, main_eps=eps)

@@ -1,4 +1,4 @@
-"""Figures of several runs, as they are drawn."""
+"""Drawing of figures that compare several runs."""
 
 import itertools
 

@@ -104,7 +104,7 @@ def test_latents_pass_the_encoder_as_often_for_many_losses() -> None:
 
 
 def halves(names: tuple[str, ...] = ("first", "second")) -> dict[str, Any]:
-    """Latents of the first and the second half of a minibatch, as two groups."""
+    """Return latents of the first and the second half of a minibatch, as two groups."""
     parts = dict(zip(("first", "second"), (slice(0, 6), slice(6, 12)), strict=True))
     return {name: functools.partial(encode_part, part=parts[name]) for name in names}
 
