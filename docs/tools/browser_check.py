@@ -97,12 +97,12 @@ def main() -> int:
     if not (options.site / "play" / "data" / "task.json").exists():
         print(f"{options.site} was built without the page's data: make page docs", file=sys.stderr)
         return 2
-    figures = measure(options.site, browser, options.seconds)
-    if "error" in figures:
-        print(f"the page does not run: {figures['error']}", file=sys.stderr)
+    measurements = measure(options.site, browser, options.seconds)
+    if "error" in measurements:
+        print(f"the page does not run: {measurements['error']}", file=sys.stderr)
         return 1
     broken = 0
-    for name, value in figures.items():
+    for name, value in measurements.items():
         low, high = BOUNDS.get(name, (float("-inf"), float("inf")))
         is_kept = low <= value <= high
         broken += not is_kept
@@ -110,7 +110,7 @@ def main() -> int:
             f"{name:16} {value:12.6g}"
             + (f"   {low:g} to {high:g}   {'kept' if is_kept else 'BROKEN'}" if name in BOUNDS else "")
         )
-    missing = BOUNDS.keys() - figures.keys()
+    missing = BOUNDS.keys() - measurements.keys()
     if missing:
         print(f"missing: {', '.join(sorted(missing))}", file=sys.stderr)
     return int(bool(broken or missing))
