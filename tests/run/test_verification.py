@@ -57,7 +57,7 @@ def verified(run_trainer) -> Callable[..., Verification]:
 
 @pytest.fixture
 def copy(straight, tmp_path) -> Path:
-    """Run of two seeds and eight iterations, evaluated, and saved fully and lightly, after every second one."""
+    """Run of two seeds and eight iterations, with an evaluation and both kinds of checkpoint after every second one."""
     return Path(shutil.copytree(straight[0], tmp_path / "run"))
 
 
