@@ -38,7 +38,7 @@ train: $(STAMPS)/$(ACCELERATOR) ## Train on VisualFetchReach; curve.png and vide
 test: $(STAMPS)/dev ## Run the tests
 	@$(BIN)/python -m pytest -n $(WORKERS) $(ARGS)
 
-fuzz: $(STAMPS)/dev ## Try EXAMPLES=2000 spoilt files of each kind on their readers, other ones each time
+fuzz: $(STAMPS)/dev ## Try EXAMPLES=2000 corrupted files of each kind on their readers, other ones each time
 	@EXAMPLES=$(EXAMPLES) $(BIN)/python -m pytest -q -rP --hypothesis-profile=fuzz $(FUZZED) $(ARGS)
 
 docs: $(STAMPS)/docs ## Build the documentation's site into build/site/

@@ -28,7 +28,7 @@ def _without(config, fields):
 
 
 def begin(program, keys):
-    """Return ``program.init`` of typed keys [S]; programs with the same initialisation share a compiled one."""
+    """Return the result of ``program.init`` for typed keys [S]; programs with the same initialisation share a compiled one."""
     env, start = program.env, _without(program.config, (*_LATER, *_NOT_AT_FIRST))
     of_env = str(env.observation_spec), env.goal_state_size, env.action_size, env.horizon
     return _compiled.setdefault(("init", start, of_env, program.resolved.critic_output_bias), program.init)(keys)

@@ -9,7 +9,7 @@ import jax
 
 @contextlib.contextmanager
 def described_nvidia() -> Iterator[None]:
-    """Declare the GPU that programs are lowered for, which JAX 0.11 requires for kernels; no effect with JAX 0.10."""
+    """Declare within the context the GPU that programs are lowered for, as JAX 0.11 requires for kernels; JAX 0.10 does not."""
     if jax.__version_info__ < (0, 11):
         yield
         return

@@ -163,7 +163,10 @@ class Worker:
 
 
 def serve(folder: Path) -> None:
-    """Answer calls from standard input, in files below ``folder``, until it ends."""
+    """Serve calls until standard input ends.
+
+    Write the files of each call below ``folder``, read them, and write the outcome to standard output.
+    """
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # libraries print
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -117,7 +117,7 @@ def difference(one, other):
 def restored_differences(loop, folder):
     """Save a checkpoint and restore it on several numbers of devices.
 
-    Return, by name of the case, the names of leaves that differ and the numbers of devices that replay is on.
+    Return, by name of the case, the names of leaves that differ, and the numbers of devices on which the replay lies.
     """
     checkpoints = Checkpoints(Path(folder), echo=lambda line: None)
     checkpoints.save_full(3, loop, {})

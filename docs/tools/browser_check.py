@@ -1,7 +1,7 @@
 """Open the playable page in headless Chromium and compare it with our renderer, policy and physics: `make page-check`.
 
-The site must be built with the page's data: `make page docs`. Each figure is printed with its bounds. Exit status: 0 all
-figures are within their bounds; 1 one is not or is missing, or the page does not run; 2 there is no page or no browser.
+The site must be built with the page's data: `make page docs`. Each measurement is printed with its bounds. Exit status: 0 all
+measurements are within their bounds; 1 one is not, or is missing, or the page does not run; 2 there is no page or no browser.
 """
 
 import argparse
@@ -38,14 +38,14 @@ BOUNDS: dict[str, tuple[float, float]] = {
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """Request handler that serves the site and receives the page's figures."""
+    """Request handler that serves the site and receives the page's measurements."""
 
     def __init__(self, *args: Any, results: "queue.Queue[dict[str, Any]]", **options: Any):
         self._results = results
         super().__init__(*args, **options)
 
     def do_POST(self) -> None:
-        """Put the figures that the page posts as JSON on the queue ``results``."""
+        """Put the measurements that the page posts as JSON on the queue ``results``."""
         self._results.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
         self.send_response(204)
         self.end_headers()
@@ -55,7 +55,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 
 
 def measure(site: Path, browser: str, seconds: float) -> dict[str, Any]:
-    """Open the page in a browser and return its figures by name.
+    """Open the page in a browser and return its measurements by name.
 
     Args:
         site: Folder of the built site.
@@ -63,7 +63,7 @@ def measure(site: Path, browser: str, seconds: float) -> dict[str, Any]:
         seconds: Timeout, s.
 
     Returns:
-        The figures; only ``error``, a message, if the page posts none in time or fails.
+        The measurements; only ``error``, a message, if the page posts none in time or fails.
     """
     results: queue.Queue[dict[str, Any]] = queue.Queue()
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=str(site), results=results))
@@ -97,12 +97,12 @@ def main() -> int:
     if not (options.site / "play" / "data" / "task.json").exists():
         print(f"{options.site} was built without the page's data: make page docs", file=sys.stderr)
         return 2
-    figures = measure(options.site, browser, options.seconds)
-    if "error" in figures:
-        print(f"the page does not run: {figures['error']}", file=sys.stderr)
+    measurements = measure(options.site, browser, options.seconds)
+    if "error" in measurements:
+        print(f"the page does not run: {measurements['error']}", file=sys.stderr)
         return 1
     broken = 0
-    for name, value in figures.items():
+    for name, value in measurements.items():
         low, high = BOUNDS.get(name, (float("-inf"), float("inf")))
         is_kept = low <= value <= high
         broken += not is_kept
@@ -110,7 +110,7 @@ def main() -> int:
             f"{name:16} {value:12.6g}"
             + (f"   {low:g} to {high:g}   {'kept' if is_kept else 'BROKEN'}" if name in BOUNDS else "")
         )
-    missing = BOUNDS.keys() - figures.keys()
+    missing = BOUNDS.keys() - measurements.keys()
     if missing:
         print(f"missing: {', '.join(sorted(missing))}", file=sys.stderr)
     return int(bool(broken or missing))

@@ -28,8 +28,8 @@ def measurement(value: float, envs: int = 4, unit: str = "images/s") -> Measurem
     )
 
 
-def under(speed: float = 1.0, **changes: Any) -> dict[str, Any]:
-    """Conditions of an idle machine, at ``speed`` times a speed."""
+def idle_conditions(speed: float = 1.0, **changes: Any) -> dict[str, Any]:
+    """Return the conditions of an idle machine whose calibration is ``speed`` times the usual one."""
     calibration = {"gflops": 100.0 * speed, "gbytes_per_s": 10.0 * speed}
     same = {"machine": "a", "cores": 2, "busy_cores": 0.0, "calibration": {"before": calibration, "after": calibration}}
     return {**same, **changes}
@@ -37,7 +37,7 @@ def under(speed: float = 1.0, **changes: Any) -> dict[str, Any]:
 
 def test_record_round_trip_and_change(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for value in (100.0, 110.0):
-        record.compare_and_keep("render", measurement(value), tmp_path, under())
+        record.compare_and_keep("render", measurement(value), tmp_path, idle_conditions())
     record.compare_and_keep("render", measurement(50.0, envs=8), tmp_path)
     lines = capsys.readouterr().out.splitlines()
     assert "(first record)" in lines[0]
@@ -56,27 +56,27 @@ def test_record_round_trip_and_change(tmp_path: Path, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("now", "then", "why"),
     [
-        (under(), None, "it does not say how fast its machine was"),
-        (under(machine="b"), under(), "it is of another machine of this name"),
-        (under(0.58), under(), "the machine itself runs at 0.58 times the speed that it had then"),
-        (under(busy_cores=1.2), under(), "other programs used 1.2 of 2 cores now"),
-        (under(), under(busy_cores=1.9), "other programs used 1.9 of 2 cores then"),
+        (idle_conditions(), None, "it does not say how fast its machine was"),
+        (idle_conditions(machine="b"), idle_conditions(), "it is of another machine of this name"),
+        (idle_conditions(0.58), idle_conditions(), "the machine itself runs at 0.58 times the speed that it had then"),
+        (idle_conditions(busy_cores=1.2), idle_conditions(), "other programs used 1.2 of 2 cores now"),
+        (idle_conditions(), idle_conditions(busy_cores=1.9), "other programs used 1.9 of 2 cores then"),
         (
-            under(calibration={"before": {"gflops": 100.0}, "after": {"gflops": 60.0}}),
-            under(calibration={"before": {"gflops": 80.0}, "after": {"gflops": 80.0}}),
+            idle_conditions(calibration={"before": {"gflops": 100.0}, "after": {"gflops": 60.0}}),
+            idle_conditions(calibration={"before": {"gflops": 80.0}, "after": {"gflops": 80.0}}),
             "while it was measured now, the machine's speed changed by -40%",
         ),
     ],
 )
 def test_only_like_is_compared_with_like(now: dict, then: dict | None, why: str) -> None:
-    """A machine of the same name at 0.58 times the speed was once told as a loss of 42 %."""
+    """Regression test: a machine of the same name at 0.58 times the speed was reported as a loss of 42 %."""
     old, new = (record.to_record(measurement(value), each) for value, each in ((100.0, then), (58.0, now)))
     line = record.describe(new, old)
     assert line.endswith(f": {why})") and "not compared with 100 of" in line and "42 %" not in line
 
 
 def test_a_change_is_told_with_the_spread_of_the_repeats() -> None:
-    old, new = (record.to_record(measurement(value), under(speed)) for value, speed in ((100.0, 1.0), (97.0, 0.95)))
+    old, new = (record.to_record(measurement(value), idle_conditions(speed)) for value, speed in ((100.0, 1.0), (97.0, 0.95)))
     line = record.describe(new, old)
     assert "-3.0 % against 100 of" in line and line.endswith("the same machine at the same speed)")
     new["details"]["spread"] = 0.04
@@ -103,7 +103,7 @@ def test_a_calibration_keeps_no_more_than_two_results_at_a_time(monkeypatch: pyt
 
 
 def test_what_a_machine_is_calibrated_with_is_computed_when_it_is_measured() -> None:
-    """Constants would be computed by the compiler: for minutes on a GPU, and then never again."""
+    """Constants would be folded by the compiler, for minutes on a GPU, and not computed when the machine is measured."""
     for work in conditions.calibrations().values():
         bytes_of_arguments = sum(array.nbytes for array in work.arguments)
         assert work.program.memory_analysis().argument_size_in_bytes == bytes_of_arguments > 0  # type: ignore[attr-defined]
@@ -148,7 +148,7 @@ def test_a_file_of_something_else_is_not_overwritten(tmp_path: Path) -> None:
 def test_a_damaged_file_is_told_before_anything_is_measured(
     contents: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The figure would be lost: it could not be kept."""
+    """Otherwise the measurement would be lost, because it could not be stored."""
     path = record.results_path("physics", tmp_path)
     path.write_text(contents)
     monkeypatch.setattr(physics, "measure", lambda _: pytest.fail("measured"))
@@ -159,7 +159,7 @@ def test_a_damaged_file_is_told_before_anything_is_measured(
 
 
 def test_json_holds_this_run_s_records(tmp_path: Path) -> None:
-    records = [record.to_record(measurement(1.0), under()), record.to_record(measurement(2.0, envs=8))]
+    records = [record.to_record(measurement(1.0), idle_conditions()), record.to_record(measurement(2.0, envs=8))]
     record.write_json(tmp_path / "deep" / "out.json", records)
     assert [entry["value"] for entry in json.loads((tmp_path / "deep" / "out.json").read_text())] == [1.0, 2.0]
 
@@ -234,7 +234,7 @@ def test_noise_fills_the_whole_replay() -> None:
 
 
 class Dot(GoalEnv):
-    """A bright dot that moves in a dark image: an environment that compiles at once."""
+    """Environment that compiles quickly: a bright dot moves in a dark image."""
 
     name, horizon, action_size, threshold, control_period = "Dot", 3, 2, 0.1, 0.1
 
@@ -262,9 +262,9 @@ class Dot(GoalEnv):
 
 @pytest.fixture
 def dots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two environments: one whose dot moves, and one whose dot does not. Images are told by the configuration, not the name.
+    """Environments ``Dot``, whose dot moves, and ``StillDot``, whose dot does not; their configuration marks them as visual.
 
-    What is timed is not repeated until the clock can tell it from noise: no test looks at how large a figure is.
+    Measurements are shorter than usual, because no test depends on their values.
     """
     monkeypatch.setattr(timing, "_MIN_SECONDS", 0.01)
     for name, moves in (("Dot", True), ("StillDot", False)):

@@ -1,4 +1,4 @@
-"""Tables and sentences of the documentation against the records of learning, and the tool that compares them."""
+"""The tool that compares tables and sentences of the documentation with the records of learning, and its verdict on them."""
 
 import subprocess
 import sys
@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def record(name: str, *seeds: list[float]) -> Record:
-    """Evaluations of some seeds at 10, 20, ... environment steps."""
+    """Return a record with evaluations of some seeds at 10, 20, ... environment steps."""
     rows = [
         {"seed": seed, "env_steps": 10 * (index + 1), "eval/success": value}
         for seed, values in enumerate(seeds)

@@ -1,4 +1,4 @@
-"""FetchReach on the host: episodes, recordings and records, with a point in the place of the robot and of OpenGL."""
+"""FetchReach on the host: episodes, recordings and records, with stand-ins for the robot and for OpenGL."""
 
 import json
 import sys
@@ -12,7 +12,7 @@ from jaxrl_vis.errors import RequestError
 
 
 class Point:
-    """Stand-in for Gymnasium-Robotics' environment: a grip that moves by at most 5 cm per step."""
+    """Stand-in for Gymnasium-Robotics' environment, with a grip that moves by at most 5 cm per step."""
 
     def reset(self, seed):
         self.grip, self.goal = np.zeros(3), np.random.default_rng(seed).uniform(-0.15, 0.15, 3)
@@ -28,7 +28,7 @@ class Point:
 
 
 class Picture:
-    """Stand-in for the camera: the brightness of its image is the grip's first coordinate."""
+    """Stand-in for the camera; the brightness of its image is the grip's first coordinate."""
 
     def __init__(self, env):
         self.env = env

@@ -26,7 +26,7 @@ def shell(tmp_path):
         ("test $NAME = value", {"NAME": "value"}),
     ],
 )
-def test_what_is_as_expected_is_no_failure(shell, words, expectations, capsys):
+def test_what_is_as_expected_is_not_a_failure(shell, words, expectations, capsys):
     shell.run(words, **expectations)
     assert not shell.failures
     assert ": as expected" in capsys.readouterr().out

@@ -69,7 +69,7 @@ def kept(value: float = 1.0, **changes: Any) -> dict[str, Any]:
 
 @pytest.fixture
 def discs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A checkout with one record of today's revision."""
+    """Checkout with one record of its current revision."""
     subprocess.run(("git", "init", "-q", str(tmp_path)), check=True)
     (tmp_path / "jaxrl_vis" / "discs").mkdir(parents=True)
     (tmp_path / "jaxrl_vis" / "discs" / "area.py").write_text(CODE)
@@ -349,7 +349,7 @@ def test_the_command_line_checks(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_tables_are_not_written_from_a_folder_that_is_not_there(
     page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A name that was misspelt once replaced every figure of the page by `MISSING`."""
+    """Regression test: with a misspelt name, every figure of the page was replaced by `MISSING`."""
     before = (records.CHECKOUT / tables.PAGE).read_text()
     page.write_text(before)
     for action in ("tables", "stale"):

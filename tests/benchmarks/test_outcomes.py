@@ -1,4 +1,4 @@
-"""The table of outcomes of files from elsewhere: a line for each case, and a fault where one ends with neither."""
+"""Table of outcomes for third-party files: one line per case, which is a fault if its reader raises an unexpected error."""
 
 import json
 

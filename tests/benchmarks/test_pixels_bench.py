@@ -19,7 +19,7 @@ MEASURES = {"segmentation": 0.9991, "matched": 0.7, "depth": None, "bare_mean": 
 
 
 class Suite:
-    """Playground's dm_control suite, as far as the command looks before it measures."""
+    """Stand-in for Playground's dm_control suite, with the only attribute that the command reads before it measures."""
 
     ALL_ENVS = ("CartpoleBalance", "FishSwim")
 

@@ -96,7 +96,7 @@ def test_the_bill_of_materials_names_packages_and_no_place(tmp_path: Path, check
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Checks that take no time, and a training that fails."""
+    """Checks that take no time, of which one fails, and a training that only returns its results."""
 
     def train(self: platform_report.Training) -> str:
         self.figures = {"task": "Thing", "preset": "debug", "env_steps": 8, "env_steps_per_s": 1234.5, "wall_s": 1.0}

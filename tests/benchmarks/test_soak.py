@@ -1,4 +1,4 @@
-"""A sample of the soak (benchmarks/soak): real runs, struck by a few faults and resumed; and how records are added."""
+"""Sample of the soak (benchmarks/soak): real runs, interrupted by a few faults and resumed, and the storage of its records."""
 
 import dataclasses
 import json

@@ -25,7 +25,7 @@ def program() -> TrainStep:
 
 @pytest.fixture(scope="module")
 def reference(program: TrainStep) -> comparison.Reference:
-    """Our steps with a fresh learner and a replay of noise."""
+    """Reference results of our steps, from a fresh learner and a replay of noise."""
     loop = jax.tree.map(lambda leaf: leaf[0], update.init_with_full_replay(program).replace(iteration=jnp.zeros(1, jnp.int32)))
     return comparison.reference(program, loop.train, loop.replay)
 

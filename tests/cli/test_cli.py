@@ -27,7 +27,7 @@ from jaxrl_vis.run.command import training_options
 
 
 def one_line(capsys: pytest.CaptureFixture[str], status: int) -> str:
-    """Checks the report of a wrong request: exactly one line, on stderr, with exit status 2."""
+    """Return the report of a wrong request, after checking that it is one line on stderr, with exit status 2."""
     output = capsys.readouterr()
     assert status == 2
     assert output.out == ""
@@ -42,8 +42,8 @@ HELP = [[], ["phenotype"], *(name.split() for name in cli.all_commands())]
 
 
 @pytest.fixture(scope="module")
-def helped() -> list[tuple[list[str], str]]:
-    """Return, for each command of `HELP`, the heavy packages imported after it, and its output; all run in one process."""
+def help_outputs() -> list[tuple[list[str], str]]:
+    """Heavy packages imported after each command of `HELP`, and its output; all run in one process."""
     code = f"""
 import contextlib, io, json, sys
 from jaxrl_vis import cli
@@ -64,8 +64,8 @@ print(json.dumps(found))
 
 
 @pytest.mark.parametrize("index", range(len(HELP)), ids=lambda index: " ".join(HELP[index]) or "jaxrl-vis")
-def test_help_imports_nothing_heavy(index: int, helped: list[tuple[list[str], str]]) -> None:
-    heavy, printed = helped[index]
+def test_help_imports_nothing_heavy(index: int, help_outputs: list[tuple[list[str], str]]) -> None:
+    heavy, printed = help_outputs[index]
     assert not heavy
     assert "usage: jaxrl-vis" in printed
 
@@ -286,7 +286,7 @@ def test_the_package_runs_as_a_program(clean_environment: dict[str, str]) -> Non
 
 @pytest.fixture
 def places(tmp_path: Path) -> dict[str, Path]:
-    """A run folder that nothing can be read of, and paths that cannot be written, by what is wrong with them."""
+    """A run folder that cannot be read, and paths that cannot be written, by the expected error."""
     run = tmp_path / "run"
     run.mkdir()
     (run / "config.json").write_text("{}")
@@ -308,7 +308,7 @@ def places(tmp_path: Path) -> dict[str, Path]:
 def test_outputs_are_checked_before_the_work(
     words: list[str], suffix: str, places: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Nothing works here: the run holds nothing, and a benchmark or a gallery would take longer than this test may."""
+    """No command could succeed: the run is empty, and a benchmark or a gallery would take longer than this test allows."""
     run = places.pop("run")
     for wrong, place in places.items():
         path = place.with_suffix(suffix)
@@ -413,7 +413,7 @@ def test_doctor_reports_what_fails(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     assert "ok    versions" in output
 
 
-def test_a_reader_that_has_seen_enough_is_no_error() -> None:
+def test_a_reader_that_closes_its_pipe_is_not_an_error() -> None:
     command = [sys.executable, "-m", "jaxrl_vis", "train", "--help"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None and program.stderr is not None

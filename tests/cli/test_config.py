@@ -1,4 +1,4 @@
-"""Configurations: what is checked, where their defaults come from, and how they come back from a file."""
+"""Configurations: their checks, the origin of their defaults, and how they are read back from a file."""
 
 import dataclasses
 import json
@@ -81,7 +81,7 @@ def test_presets_make_sense_and_come_back_from_json(name: str) -> None:
 
 
 def test_a_preset_leaves_out_what_the_method_cannot_do() -> None:
-    """The finger's presets look at true states, which indicator methods do without."""
+    """The finger's presets replace most trivial goals, but only where rewards are computed from true states."""
     for name, env in (("fast", "VisualFingerTurn"), ("cpu", "FingerTurn")):
         assert validate(preset(name, env=env)).goals.trivial_goals < 1.0
         assert validate(preset(name, env=env, trivial_goals=0.9)).goals.trivial_goals == 0.9

@@ -1,7 +1,7 @@
-"""docs/mistakes.md says what is shown after each of the usual mistakes: here each is made.
+"""Each of the usual mistakes in docs/mistakes.md is made here, and what is shown must be what the page says.
 
 Every row of the table has a mistake, in backticks: a command line, or a line of Python. What is shown follows, in backticks as
-well, with `...` where it goes on differently from machine to machine.
+well, with `...` for what depends on the machine.
 """
 
 import json
@@ -39,14 +39,14 @@ def matches(shown: str, expected: str) -> bool:
 
 @pytest.fixture(scope="module")
 def start() -> State:
-    """A state of Reacher; what is in it does not matter, and nothing is compiled for it."""
+    """State of Reacher that contains zeros, for which nothing is compiled."""
     env = jaxrl_vis_envs.make("Reacher")
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(env.reset, jax.random.key(0)))
 
 
 @pytest.fixture
 def folder(here: Path) -> Path:
-    """The current folder: runs/mine, which is trained no further than its config.json, and a task in my_task.py."""
+    """Current folder with a run, runs/mine, that has a configuration but was never trained, and a task in my_task.py."""
     run = here / "runs" / "mine"
     (run / "checkpoints").mkdir(parents=True)
     (run / "config.json").write_text(

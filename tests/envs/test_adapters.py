@@ -34,7 +34,7 @@ HORIZON = probes.Probe.horizon
 
 
 class Wide(probes.PointImage):
-    """Images of different height, width and channels."""
+    """Probe whose images differ in height, width and number of channels."""
 
     def see(self, position):
         return super().see(position)[:, :2].repeat(3, axis=0)
@@ -117,7 +117,7 @@ def test_reward_equals_compute_reward_of_the_observation():
         achieved, desired = np.array(achieved), np.array(desired)
         np.testing.assert_array_equal(env.compute_reward(achieved, desired, {}), np.float32(rewards))
         assert len(set(rewards)) > 1
-        # Goals that a learner puts in later: any batch axes, and the same numbers as the one place that knows rewards.
+        # Goals that a learner puts in later: any batch axes, and the same numbers as the function that computes rewards.
         others = np.roll(desired, 1, axis=0)
         relabelled = env.compute_reward(achieved.reshape(4, 5, 1), others.reshape(4, 5, 1), {})
         assert relabelled.shape == (4, 5) and relabelled.dtype == np.float32

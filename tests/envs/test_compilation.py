@@ -1,4 +1,4 @@
-"""Which implementation a program contains follows its platform and what people ask for; no GPU is needed."""
+"""Choice of the implementation in a program, by its platform and the user's request; no GPU is needed."""
 
 import gc
 import importlib
@@ -35,7 +35,7 @@ KERNEL_CALL = "__gpu$xla.gpu.triton"
 
 @pytest.fixture
 def gpu(monkeypatch):
-    """Makes the process believe that there is an NVIDIA GPU beside the CPU; call it with a compute capability."""
+    """Function that adds an NVIDIA GPU of a given compute capability to the devices that the process sees."""
 
     def add(capability: str = "9.0") -> None:
         card = SimpleNamespace(compute_capability=capability, device_kind="NVIDIA Test")
@@ -115,7 +115,7 @@ def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypa
 
 
 def run_of(function) -> Programs:
-    """A run of which ``init`` is a function of keys, and nothing else is there."""
+    """Return the programs of a run that has nothing but ``init``, a function of keys."""
     programs = Programs(
         preset("debug"), SimpleNamespace(env=None, layout=ONE_DEVICE, part_size=1, plays_parts=False, init=jax.jit(function))
     )
@@ -225,7 +225,7 @@ def test_a_program_holds_the_branch_of_its_own_platform(gpu):
 
 
 def test_mlir_finds_the_dialect_of_triton(monkeypatch):
-    """MLIR expects the dialect in another module than jaxlib's; once that has changed, the name given to it here can go."""
+    """MLIR looks for the dialect under a name that jaxlib lacks; once jaxlib has it, the alias tested here can be removed."""
     name = "jaxlib.mlir.dialects.tt"
     monkeypatch.delitem(sys.modules, name, raising=False)
     with pytest.raises(ImportError):

@@ -1,4 +1,4 @@
-"""Goals are attainable: a controller on the true state reaches them (the full figure: benchmarks/tasks/controllers.py)."""
+"""Goals are attainable: a controller that observes the true state reaches them (all tasks: benchmarks/tasks/controllers.py)."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Plots by day: families without them stay as they were, truth is right in turned images, and effects do what they say."""
+"""Daytime plots: other families are unchanged, the ground truth fits rotated images, and effects do what they claim."""
 
 import dataclasses
 from pathlib import Path
@@ -53,7 +53,7 @@ def bare() -> tuple[Sequence, tuple]:
     ids=["training", "shifted"],
 )
 def test_families_without_days_are_as_they_were(family, sums):
-    """Sums of the surfaces are as before there were plots by day; images follow from them by a program of their own."""
+    """Sums of the surfaces equal those from before daytime plots were added; images follow from them in another program."""
     plot = plants.draw(family, 3)
     assert plot.family is family and settle(family, generator(family, 3, "scene")) is family
     assert daylight(family, 3) is None
@@ -156,7 +156,7 @@ def test_backdrops(monkeypatch):
 
 
 def one_blade() -> Blades:
-    """A blade 2 m before a camera at the origin that looks along z, 20 cm tall: 100 to 50 rows below the centre."""
+    """A blade, 20 cm tall, 2 m in front of a camera at the origin that looks along z: 100 to 50 rows below the centre."""
     points = np.array([[[0.0, 0.4, 2.0], [0.0, 0.3, 2.0], [0.0, 0.2, 2.0]]])
     return Blades(points, np.array([0.02]), np.array([[3.0, 2.0, 1.0]]))
 

@@ -59,7 +59,7 @@ def play(name: str, state: State, actions: Any) -> list[State]:
 
 @functools.cache
 def images(task: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Images [BATCH, C, H, W] of the goals, of the starts, and after the last step."""
+    """Return images [BATCH, C, H, W] of the goals, of the starts and of the last states."""
     env, played = make_visual(task), episode(task)
     nowhere = jnp.zeros(played.states[0].goal_state.shape[1])
     observe = jaxrl_vis_envs.jit(jax.vmap(lambda data: env.observe(env.state_at(data, nowhere))))
@@ -149,7 +149,7 @@ def test_images_show_goals_and_movement(name: str) -> None:
 
 @functools.cache
 def seen_episodes(frame_stack: int = 1) -> tuple[GoalEnv, State, State]:
-    """Four episodes of a visual task, run as one program: the task, their starts, their states [STEPS, 4] after actions."""
+    """Return a visual task and four episodes, run as one program: their starts, and their states [STEPS, 4] after actions."""
     env = PointMass(PointMassConfig(image_size=16, frame_stack=frame_stack))
     actions = jax.random.uniform(jax.random.key(1), (STEPS, 4, 2), minval=-1.0)
     actions = actions.at[:3, 0].set(jnp.array([[1.0], [-0.5], [0.8]]))  # so that no two of the first images are alike
@@ -367,7 +367,7 @@ def test_observation_kind_is_known_before_building(monkeypatch):
 
 
 def test_numpy_is_rewarded_by_numpy():
-    """A learner on the host pays for no transfer and no compilation."""
+    """Rewards of NumPy arrays are NumPy arrays, so that learners on the host need neither transfer nor compilation."""
     images = np.zeros((2, 3, 4, 4), np.uint8)
     other = images.copy()
     other[1, 0, 0, 0] = 1

@@ -1,4 +1,4 @@
-"""FetchPush: starts, goals, what goals tell, and contacts of boxes. Its physics: tests/physics/test_physics_parity.py."""
+"""FetchPush: starts, goals, relabelled goals, and contacts of boxes. Its physics: tests/physics/test_physics_parity.py."""
 
 import functools
 
@@ -61,7 +61,7 @@ def test_places_that_cannot_be_drawn(overrides, complaint):
 
 
 def test_a_goal_tells_of_the_box_alone():
-    """A relabelled goal has the form of those that are drawn, wherever arm and box were and however they moved."""
+    """A relabelled goal has the form of sampled goals, and depends on the box's position alone, however arm and box moved."""
     env = environments.make("FetchPush")
     desired = jaxrl_vis_envs.jit(lambda key: env.observe_state(env.sample_goal(key)))(jax.random.key(3))
     np.testing.assert_allclose(env.as_goal(desired), desired, atol=2e-6)
@@ -94,7 +94,7 @@ POSES = {
 
 @functools.cache
 def contacts_of_boxes() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Contacts [K, 7] in each pose, MuJoCo's and ours: position (m), normal, distance (m); in order."""
+    """Return contacts [K, 7] in each pose, MuJoCo's and ours, sorted by position: position (m), normal, distance (m)."""
     mj_model = mujoco.MjModel.from_xml_string(TWO_BOXES)
     mj_data, model = mujoco.MjData(mj_model), mjx.put_model(mj_model)
     still = mjx_model.rest_data(mj_model)

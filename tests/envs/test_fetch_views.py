@@ -1,4 +1,4 @@
-"""VisualFetchReach as contrastive RL has it: its camera beside MuJoCo's own, and its goal images."""
+"""VisualFetchReach as in contrastive RL: its camera, compared with MuJoCo's own, and its goal images."""
 
 import functools
 
@@ -24,7 +24,7 @@ def env():
 
 @functools.cache
 def states():
-    """Eight episodes at their beginning."""
+    """States of eight episodes at their start."""
     return jax.device_get(jaxrl_vis_envs.jit(jax.vmap(env().reset))(jax.random.split(jax.random.key(0), 8)))
 
 

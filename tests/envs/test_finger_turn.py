@@ -19,7 +19,7 @@ def make():
 
 @functools.cache
 def starts_and_goals():
-    """COUNT episodes at their start, and the configurations that their goals show."""
+    """Return the states of COUNT episodes at their start, and the configurations that their goals show."""
     return environments.reset(make(), jax.random.split(jax.random.key(3), COUNT))
 
 

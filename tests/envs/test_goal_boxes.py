@@ -1,4 +1,4 @@
-"""The box in which goals can be placed by hand is that which goals are drawn from, and the robot gets to points of it."""
+"""The box in which goals can be placed by hand is that from which goals are sampled, and the robot can reach points in it."""
 
 import itertools
 

@@ -25,7 +25,7 @@ def make(**overrides):
 
 @functools.cache
 def goals():
-    """Configurations of COUNT goals."""
+    """Return the configurations of COUNT goals."""
     return environments.reset(make(), jax.random.split(jax.random.key(3), COUNT))[1]
 
 

@@ -70,7 +70,7 @@ def my_task(here: Path) -> str:
 
 @pytest.fixture
 def package(tmp_path: Path, here: Path) -> Callable[..., None]:
-    """Install packages with entry points: a folder on Python's path, as `pip install` leaves it."""
+    """Function that installs packages with entry points as `pip install` does, in a folder on Python's path."""
     site = tmp_path / "site-packages"
     site.mkdir()
     sys.path.append(str(site))

@@ -1,4 +1,4 @@
-"""Images for environments of other libraries, by one call: brax's, stand-ins of others, plain models, Gymnasium's."""
+"""Images for environments of other libraries, by one call: for brax, stand-ins of others, plain models and Gymnasium."""
 
 import dataclasses
 import pickle
@@ -76,7 +76,7 @@ class PlaygroundState:
 
 
 class PlaygroundEnv:
-    """The interface of MuJoCo Playground's `mjx_env.MjxEnv`, as its tasks fill it in: a cart that is pushed."""
+    """Stand-in for MuJoCo Playground's `mjx_env.MjxEnv`, with the members that its tasks define: a cart that is pushed."""
 
     def __init__(self) -> None:
         self._mj_model = mujoco.MjModel.from_xml_string(_XML)
@@ -112,7 +112,7 @@ class PlaygroundEnv:
 
 
 def truth(mj_model: mujoco.MjModel, qpos: Any, camera: str | int, size: int = SIZE) -> Frame:
-    """The image of a model at joint positions, by the renderer alone."""
+    """Return the image of a model at joint positions, rendered directly."""
     mj_data = mujoco.MjData(mj_model)
     mj_data.qpos[:] = qpos
     mujoco.mj_forward(mj_model, mj_data)
@@ -120,7 +120,7 @@ def truth(mj_model: mujoco.MjModel, qpos: Any, camera: str | int, size: int = SI
 
 
 def assert_same_colours(image: Any, frame: Frame) -> None:
-    """Float images from 0 to 1 equal those of a frame, but for rounding at edges."""
+    """Compare float images from 0 to 1 with those of a frame, apart from rounding at edges."""
     difference = np.abs(np.rint(255.0 * np.asarray(image)) - np.asarray(frame.rgb))
     assert np.mean(difference > 1) < 0.01 and np.asarray(frame.rgb).std() > 5
 
@@ -172,7 +172,7 @@ def test_several_frames_show_the_last_images(layout: Any) -> None:
         return states
 
     def stack(state: Any) -> np.ndarray:
-        """The three images, then that of the goal: [4, H, W, 3]."""
+        """Return the three images and that of the goal, [4, H, W, 3]."""
         names = ("pixels/front", "pixels/front/goal")
         joined = state.obs if layout == "image" else jnp.concatenate([state.obs[name] for name in names], axis=-1)
         return np.moveaxis(np.asarray(joined).reshape(SIZE, SIZE, 4, 3), 2, 0)
@@ -360,7 +360,7 @@ def test_gymnasium_environments_stay_on_the_host() -> None:
 
 
 class TargetEnv(gymnasium.Env):
-    """A cart that moves the site of its target when it renders, and then computes poses, as Gymnasium-Robotics does."""
+    """Environment of a cart; rendering moves the site of its target and computes poses afterwards, as in Gymnasium-Robotics."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))

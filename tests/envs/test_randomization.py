@@ -1,4 +1,4 @@
-"""Domain randomisation: active ranges change only what they should, and with all off nothing changes."""
+"""Domain randomisation: active ranges change only what they should; if all are off, nothing changes."""
 
 import functools
 from typing import Any, get_args
@@ -36,7 +36,7 @@ def make(ranges: Randomization, **options: Any) -> PointMass:
 
 @functools.cache
 def episodes(ranges: Randomization = OFF) -> tuple[Any, Any]:
-    """Starts of COUNT episodes, and their state after STEPS full actions."""
+    """Return the starts of COUNT episodes, and their states after STEPS full actions."""
     env = make(ranges)
 
     def play(keys: jax.Array) -> tuple[Any, Any]:
@@ -64,7 +64,7 @@ def test_off_adds_nothing() -> None:
     assert len(jax.tree.leaves(with_all)) == len(jax.tree.leaves(start)) + len(ALL.active)
     assert sum(leaf.size for leaf in jax.tree.leaves(with_all.domain)) < 200
 
-    # Nor to the program: it is that of an environment which knows of no randomisation.
+    # Nor to the program: it is that of an environment without randomisation.
     class Plain(PointMass):
         def reset(self, key: jax.Array) -> Any:
             data, goal = self.sample_start(key), self.sample_goal(key)
@@ -196,7 +196,7 @@ def test_each_range_of_the_dynamics_scales_its_leaves(task: str) -> None:
 
 
 def test_mjx_steps_a_varied_model_as_mujoco_does() -> None:
-    """The changed leaves exist in MuJoCo's own model: C MuJoCo with the same values moves the same."""
+    """The changed leaves exist in MuJoCo's own model: with the same values, C MuJoCo moves in the same way."""
     end = jax.tree.map(lambda leaf: np.asarray(leaf[0], np.float64), episodes(ALL)[1])
     start = episodes(ALL)[0]
     model = mujoco.MjModel.from_xml_string(point_mass.XML)

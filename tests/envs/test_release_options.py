@@ -25,7 +25,7 @@ def make(name: str, **options: Any) -> Any:
 
 @functools.cache
 def poses(name: str, **options: Any) -> tuple[Any, Any, np.ndarray]:
-    """COUNT starts, the configurations that their goals show, and the goal states."""
+    """Return COUNT starts, the configurations that their goals show, and the goal states."""
     env = make(name, **options)
 
     def sample(key: jax.Array) -> tuple[Any, Any, jax.Array]:
@@ -37,7 +37,7 @@ def poses(name: str, **options: Any) -> tuple[Any, Any, np.ndarray]:
 
 @functools.cache
 def images(**options: Any) -> np.ndarray:
-    """Images of the starts, then of the goals: [2 COUNT, 4, SIZE, SIZE] uint8."""
+    """Return images of the starts, then of the goals: [2 COUNT, 4, SIZE, SIZE] uint8."""
     env = make("VisualFetchReach", image_size=SIZE, **options)
     cross_hair = {name: value for name, value in options.items() if name == "cross_hair"}
     start, goal, _ = poses("VisualFetchReach", image_size=SIZE, **cross_hair)

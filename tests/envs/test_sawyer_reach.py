@@ -17,7 +17,7 @@ def make():
 
 @functools.cache
 def starts():
-    """State of COUNT episodes at their start."""
+    """Return the states of COUNT episodes at their start."""
     return environments.reset(make(), jax.random.split(jax.random.key(3), COUNT))[0]
 
 

@@ -21,7 +21,7 @@ def make():
 
 @functools.cache
 def starts():
-    """States of COUNT episodes at their start, and the configurations of their goals."""
+    """Return the states of COUNT episodes at their start, and the configurations of their goals."""
     return environments.reset(make(), jax.random.split(jax.random.key(3), COUNT))
 
 

@@ -1,4 +1,4 @@
-"""Surroundings of plots by day: each factor shows in images, and what is no stalk never changes which stalk a pixel shows."""
+"""Surroundings of daytime plots: each factor changes the image, and no pixel becomes part of a stalk."""
 
 import dataclasses
 import functools
@@ -53,7 +53,7 @@ def test_a_single_plant_fills_an_upright_image():
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
 def test_each_factor_shows_and_leaves_the_stalk_where_it_is(factor, minimum):
-    """Only nearer things hide a stalk: nothing makes a pixel a stalk's that was not."""
+    """Surroundings in front of a stalk may hide it, but no pixel becomes part of one."""
     shares = []
     for seed in (3, 4):
         base, (image, instance, _) = rendered(seed)

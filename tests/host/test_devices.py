@@ -1,4 +1,4 @@
-"""Devices that JAX computes on: reported in one line if missing, and guessed for help that must not wait for JAX."""
+"""Devices of JAX: reported in one line if missing, and guessed for help texts, which must not wait for JAX."""
 
 import json
 import logging
@@ -36,7 +36,7 @@ print(json.dumps(told))
 def test_no_accelerator_where_one_is_asked_for(
     asked: str, clean_environment: dict[str, str], tmp_path: Path, checkout: Path
 ) -> None:
-    """Every command says in one line what was asked for, what there is and how to mend it."""
+    """Every command reports in one line which platform was requested, which one there is, and how to correct the request."""
     run = tmp_path / "run"
     run.mkdir()
     (run / "config.json").write_text(json.dumps({"schema": 2, "config": {"environment": {"env": "Reacher"}}}))
@@ -60,7 +60,7 @@ def test_no_accelerator_where_one_is_asked_for(
 
 
 def test_asking_python_again_does_not_change_the_answer(clean_environment: dict[str, str]) -> None:
-    """A first refusal, which looks for what there is, must not let the second attempt run on that."""
+    """The first refusal initialises the existing devices; a second attempt must not use them."""
     code = """
 import jaxrl_vis
 for _ in range(2):
@@ -119,7 +119,7 @@ def test_training_claims_most_of_a_gpu_unless_told_how_much(variables: dict[str,
 
 @pytest.fixture
 def jax_config():
-    """JAX's settings, which are put back after the test, and its cache is started anew."""
+    """Function that changes a setting of JAX; after the test, settings are restored and the compilation cache is reset."""
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 

@@ -1,4 +1,4 @@
-"""Several processes that train as one: how they find each other, what they learn and save, and how they end."""
+"""Training in several processes: how they find each other, what they learn and save, and how they end."""
 
 import os
 import signal
@@ -68,7 +68,7 @@ def free_port() -> int:
 
 
 def start(run_dir: Path, count: int, devices: int, *options: str) -> list[subprocess.Popen]:
-    """Processes of `two_processes`, with so many devices each."""
+    """Start ``count`` processes of `two_processes`, with ``devices`` devices each, and return them."""
     tests = Path(__file__).parents[1]
     paths = (tests, tests.parent, tests.parent / "envs")
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
@@ -82,8 +82,8 @@ def start(run_dir: Path, count: int, devices: int, *options: str) -> list[subpro
     ]
 
 
-def ended(processes: Sequence[subprocess.Popen], seconds: float = 120.0) -> list[tuple[int, str, str]]:
-    """Exit status and output of process."""
+def wait_for_processes(processes: Sequence[subprocess.Popen], seconds: float = 120.0) -> list[tuple[int, str, str]]:
+    """Wait for processes to end, for at most ``seconds`` each, and return the exit status and output of each."""
     try:
         outputs = [process.communicate(timeout=seconds) for process in processes]
     finally:
@@ -94,18 +94,19 @@ def ended(processes: Sequence[subprocess.Popen], seconds: float = 120.0) -> list
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list, list, float]:
-    """A run of two processes, of a device each, of which the second dies; and two others that go on with it.
+    """Run of two processes with one device each, of which the second dies, and which two others resume.
 
-    Its folder, how the first two ended, how the others did, and the seconds from one's death to the other's end.
+    Returns its folder, the results of the first two and of the other two (see `ended`), and the seconds from the death of the
+    second process to the end of the first.
     """
     run_dir = tmp_path_factory.mktemp("processes") / "pair"
     processes = start(run_dir, 2, 1, "die_at=3")
     processes[1].wait(200)
     died = time.monotonic()
-    ends = ended(processes)
+    ends = wait_for_processes(processes)
     seconds = time.monotonic() - died
     assert Checkpoints(run_dir / "checkpoints", read_only=True).newest() == 2
-    return run_dir, ends, ended(start(run_dir, 2, 1, "resume=1")), seconds
+    return run_dir, ends, wait_for_processes(start(run_dir, 2, 1, "resume=1")), seconds
 
 
 def test_a_process_that_dies_ends_the_others_and_leaves_the_checkpoint(pair: tuple[Path, list, list, float]) -> None:
@@ -119,7 +120,7 @@ def test_a_process_that_dies_ends_the_others_and_leaves_the_checkpoint(pair: tup
 
 def test_two_processes_learn_and_save_what_one_does(pair: tuple[Path, list, list, float], tmp_path: Path) -> None:
     run_dir, *_ = pair
-    ((status, _, words),) = ended(start(tmp_path / "one", 1, 2))
+    ((status, _, words),) = wait_for_processes(start(tmp_path / "one", 1, 2))
     assert status == 0, words
     for ours, theirs in zip(rows_without_time(run_dir), rows_without_time(tmp_path / "one"), strict=True):
         assert ours == pytest.approx(theirs, abs=1e-5, nan_ok=True)
@@ -133,15 +134,15 @@ def test_two_processes_learn_and_save_what_one_does(pair: tuple[Path, list, list
 
 
 def two_trainings(*words: str) -> list[tuple[int, str, str]]:
-    """Runs `jaxrl-vis train` in two processes with one device each; returns exit statuses and outputs."""
+    """Run `jaxrl-vis train` in two processes with one device each; return exit statuses and outputs."""
     train = [sys.executable, "-m", "jaxrl_vis", "train", *words, "--preset", "debug", "--env-steps", "40"]
     place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", "2", "--process-id"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return ended([subprocess.Popen([*train, *place, index], **pipes) for index in ("0", "1")], 200)
+    return wait_for_processes([subprocess.Popen([*train, *place, index], **pipes) for index in ("0", "1")], 200)
 
 
 def test_processes_train_a_task_with_physics(tmp_path: Path) -> None:
-    """Its model must lie on devices of each process itself."""
+    """Each process must place the task's model on its own devices."""
     task = ["point_mass:StatePointMass", "--env-folder", str(Path(__file__).parents[1])]
     ends = two_trainings(*task, "--seeds", "2", "--run-dir", str(tmp_path / "run"))
     assert [status for status, _, _ in ends] == [0, 0], ends
@@ -149,7 +150,7 @@ def test_processes_train_a_task_with_physics(tmp_path: Path) -> None:
 
 
 def test_each_process_says_why_it_refuses(tmp_path: Path) -> None:
-    """No process is ended by JAX because another one was faster."""
+    """JAX does not end a process because the other one has ended first."""
     ends = two_trainings("Reacher", "--seeds", "3", "--run-dir", str(tmp_path / "run"))
     assert [status for status, _, _ in ends] == [2, 2], ends
     assert all("seeds 3 cannot be divided among 2 devices" in words.splitlines()[-1] for _, _, words in ends), ends
@@ -171,7 +172,7 @@ def test_a_signal_to_one_process_saves_and_ends_all(tmp_path: Path) -> None:
     while not second.readline().startswith("report"):
         assert processes[1].poll() is None
     processes[1].send_signal(signal.SIGUSR2)
-    ends = ended(processes)
+    ends = wait_for_processes(processes)
     assert [status for status, _, _ in ends] == [128 + signal.SIGUSR2] * 2, ends
     assert "SIGUSR2: saving" in ends[0][1]
     checkpoints = Checkpoints(tmp_path / "run" / "checkpoints", read_only=True)

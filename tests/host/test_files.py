@@ -1,4 +1,4 @@
-"""Files that are written in one step, and JSON that somebody else has written."""
+"""Files that are written atomically, and JSON that other programs have written."""
 
 import json
 import os
@@ -45,7 +45,7 @@ def test_names_that_no_system_knows_are_one_line(tmp_path, name):
 
 
 def test_writers_side_by_side_do_not_disturb_each_other(tmp_path):
-    """Each has a temporary file of its own: with one for all, one writer's contents would vanish under the other's name."""
+    """Each writer has a temporary file of its own: in a shared one, they would overwrite each other's contents."""
     path = tmp_path / "file.json"
     with replacing(path) as first:
         first.write(b'{"by": "first"}')

@@ -1,4 +1,4 @@
-"""Parts of a person's own, one file each in a folder outside the package: those of docs/extending.md, trained as it says."""
+"""User-defined parts, one file each in a folder outside the package: those of docs/extending.md, trained as it describes."""
 
 import json
 import re
@@ -40,7 +40,7 @@ SMALL = ["--env-steps", "32", "--eval-episodes", "2"]
 
 @pytest.fixture
 def elsewhere(here: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A current folder with the files of the page; the user's cache is empty."""
+    """Current folder with the files of the page; the user's cache is empty."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(trust, "_trusted_here", set())
     for name, text in FILES.items():

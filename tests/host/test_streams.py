@@ -44,7 +44,7 @@ def in_ascii():
 
 
 class Odd(io.StringIO):
-    """A stream of a notebook whose kernel is gone."""
+    """Stream of a notebook whose kernel has died."""
 
     def write(self, text):
         raise RuntimeError("no kernel")
@@ -60,7 +60,7 @@ BROKEN = {
 
 
 def let_go(stream) -> None:
-    """Closes a stream that may hold what it cannot write."""
+    """Close a stream that may hold data that it cannot write."""
     with contextlib.suppress(OSError):
         if stream is not None:
             stream.close()
@@ -113,7 +113,7 @@ def test_a_run_goes_on_when_its_terminal_is_gone(tmp_path, monkeypatch):
 
 
 def shown_on_a_terminal(width, monkeypatch, show) -> list[str]:
-    """Returns the last lines of a terminal of a given width."""
+    """Return the lines that ``show`` prints on a terminal of a given width."""
     keeper, terminal = pty.openpty()
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", str(width))
@@ -199,7 +199,7 @@ def test_environments_are_made_without_a_stdout(kind, monkeypatch):
     let_go(stream)
 
 
-def test_what_is_no_fault_of_the_disk_is_not_told_as_one(tmp_path, monkeypatch):
+def test_other_faults_are_not_reported_as_faults_of_the_disk(tmp_path, monkeypatch):
     trainer = make_fake_trainer(small_config(), tmp_path / "run")
 
     def broken(*_):

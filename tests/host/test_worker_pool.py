@@ -1,4 +1,4 @@
-"""Numbers evaluated in processes side by side, and the file that keeps what came of them."""
+"""Evaluation of numbers in parallel processes, and the file that stores the results."""
 
 import functools
 import itertools
@@ -47,7 +47,7 @@ def killed(number: int) -> Record:
 
 
 def signalled(number: int) -> Record:
-    """Signals itself, as somebody would who signals the whole group of processes."""
+    """Send all signals to this process, as somebody would who signals the whole process group."""
     for item in signals.SIGNALS:
         subprocess.run(["kill", f"-{item}", str(os.getpid())], check=True)
     return {"ignored": sorted(signal.pthread_sigmask(signal.SIG_BLOCK, ()))}
@@ -143,7 +143,7 @@ def test_processes_end_with_the_one_that_started_them_however_that_ends(tmp_path
         started.kill()
         started.wait()
     workers = [int(path.read_text()) for path in tmp_path.glob("*.pid")]
-    wait_until(lambda: not any(runs(worker) for worker in workers), 10.0)
+    wait_until(lambda: not any(is_running(worker) for worker in workers), 10.0)
 
 
 def wait_until(holds: Callable[[], bool], seconds: float) -> None:
@@ -153,8 +153,8 @@ def wait_until(holds: Callable[[], bool], seconds: float) -> None:
         time.sleep(0.05)
 
 
-def runs(process: int) -> bool:
-    """Returns True if a process runs; an ended one may still be listed."""
+def is_running(process: int) -> bool:
+    """Return True if a process is running; an ended one may still be listed."""
     try:
         os.kill(process, 0)
         status = Path(f"/proc/{process}/stat")

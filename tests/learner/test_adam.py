@@ -1,4 +1,4 @@
-"""Our steps of Adam, which several networks take together, are those that optax takes with each by itself."""
+"""Steps of our Adam, taken for several networks together, equal those of optax for each network."""
 
 import jax
 import jax.numpy as jnp
@@ -15,14 +15,14 @@ RATES = (1e-3, 3e-2)
 
 
 def draw(key):
-    """Two networks, or their gradients."""
+    """Return random parameters of two networks, or their gradients."""
     keys = jax.random.split(key, 3)
     networks = {"kernel": jax.random.normal(keys[0], (5, 3)), "bias": jax.random.normal(keys[1], (3,))}
     return networks, {"output": {"bias": jax.random.normal(keys[2], (1,))}}
 
 
 def test_steps_are_those_of_optax():
-    """Steps are equal even after an interval in which only one of the networks took any."""
+    """Steps are equal although one of the networks takes only every third one."""
     ours, theirs = draw(jax.random.key(0)), draw(jax.random.key(0))
     states = [adam.init(params) for params in ours]
     optimizers = [optax.adam(rate) for rate in RATES]
@@ -46,7 +46,7 @@ def test_steps_are_those_of_optax():
 
 
 def test_a_learner_goes_on_where_it_stopped():
-    """Two iterations of two updates each leave the counters that one of four does."""
+    """Two iterations of two updates leave the same counters as one iteration of four."""
     counters = []
     for calls, updates in ((1, 4), (2, 2)):
         config = preset("debug", num_envs=4, batch_size=8, updates_per_iteration=updates, actor_interval=2)

@@ -34,7 +34,7 @@ def rollout() -> Episodes:
 
 @jax.jit
 def _rollout(key: jax.Array) -> Episodes:
-    """Episodes of a bright spot that actions move over a fixed pattern."""
+    """Return episodes of a bright spot that actions move over a fixed pattern."""
     keys = jax.random.split(key, 3)
     actions = jax.random.uniform(keys[0], (EPISODES, HORIZON, ACTIONS), minval=-1.0, maxval=1.0)
     places = jnp.cumsum(jnp.pad(2.0 * actions, ((0, 0), (1, 1), (0, 0))), axis=1) + 8.0
@@ -51,13 +51,13 @@ def config(**overrides):
 
 @functools.cache
 def drawn_places():
-    """Episodes and slots of a batch, [2, B]."""
+    """Return random episodes and slots of a batch, [2, B]."""
     return jax.device_get(jax.random.randint(jax.random.key(1), (2, BATCH), 0, EPISODES))
 
 
 @functools.cache
 def stored(with_flow):
-    """The rollout as a learner stores it that does or does not learn optical flow."""
+    """Return the rollout as stored by a learner that learns optical flow, or by one that does not."""
     if not with_flow:
         return rollout()
     auxiliary = make_auxiliary(config(aux_tasks=("optical_flow",), weighting="sum"), SPEC, ACTIONS, 1, jnp.float32)
@@ -66,7 +66,7 @@ def stored(with_flow):
 
 @functools.cache
 def fresh(tasks, encoders, target_encoder, filters):
-    """A fresh learner but for the state of its weighting: how losses are weighted changes nothing else at the beginning."""
+    """Return a fresh learner with any weighting, because weightings change nothing else at initialisation."""
     networks = {"encoders": encoders, "target_encoder": target_encoder, "encoder_filters": filters}
     chosen = config(aux_tasks=tasks, weighting="sum" if tasks else "none", **networks)
     algorithm = make_ddpg(Networks(chosen, SPEC, ACTIONS, 0.0), chosen, resolve(chosen, HORIZON))
@@ -76,7 +76,7 @@ def fresh(tasks, encoders, target_encoder, filters):
 
 @functools.cache
 def learner(mode=None, **overrides):
-    """The learner, one update as a compiled function, and its state and batch at the beginning."""
+    """Return a learner, its update as a compiled function, and its initial state and batch."""
     chosen = config(**overrides)
     networks = Networks(chosen, SPEC, ACTIONS, 0.0)
     auxiliary = make_auxiliary(chosen, SPEC, ACTIONS, 1, networks.dtype)
@@ -106,8 +106,8 @@ def learner(mode=None, **overrides):
     return algorithm, update, algorithm.begin(start, Statistics(normalizer.init(SPEC), None)), batch
 
 
-def sizes(tree):
-    """The norm of each part."""
+def magnitudes(tree):
+    """Return the root mean square of each part, averaged over its leaves."""
     return {
         name: float(np.sqrt(np.mean([np.mean(np.square(x)) for x in jax.tree.leaves(part)]))) for name, part in tree.items()
     }
@@ -118,7 +118,7 @@ def test_every_auxiliary_loss_is_learned_and_reaches_both_encoders():
     _, gradients, first = update(working, batch)
     for network in (gradients.critic, gradients.actor):
         assert set(network) == {"encoder", "head", "heads"} and set(network["heads"]) == set(ALL)
-        assert all(size > 0 for size in sizes(network).values()) and all(size > 0 for size in sizes(network["heads"]).values())
+        assert all(size > 0 for part in (network, network["heads"]) for size in magnitudes(part).values())
     for _ in range(60):
         working, _, last = update(working, batch)
     for name in ALL:
@@ -127,7 +127,7 @@ def test_every_auxiliary_loss_is_learned_and_reaches_both_encoders():
 
 
 def test_a_weighted_gradient_is_the_sum_of_the_losses_own():
-    """With fixed weights, the gradient with two tasks is the sum of those with one task each, less their common part."""
+    """With fixed weights, the gradient with two tasks is the sum of those with one task each, less that without tasks."""
     found = {}
     for tasks in ((), ("inverse_dynamics",), ("egomotion",), ("inverse_dynamics", "egomotion")):
         weighting = {"weighting": "fixed", "weighting_fixed": 3.0} if tasks else {"weighting": "none_log"}
@@ -192,13 +192,13 @@ def test_heads_of_both_networks_learn_while_their_losses_are_kept_out_of_the_enc
     for found, one in ((always.critic, ones.critic), (always.actor, ones.actor)):
         for left, right in zip(jax.tree.leaves(found["heads"]), jax.tree.leaves(one["heads"]), strict=True):
             np.testing.assert_allclose(left, right, rtol=1e-4, atol=1e-6)
-        assert sizes(found["heads"])["inverse_dynamics"] > 0
+        assert magnitudes(found["heads"])["inverse_dynamics"] > 0
     _, update, start, _ = learner(mode, **tasks, weighting="ol_aux")
     _, weighted, _ = update(start._replace(agent=start.agent.replace(weighting=state)), batch)
     for found, one in ((always.critic, weighted.critic), (always.actor, weighted.actor)):
         for left, right in zip(jax.tree.leaves(found["encoder"]), jax.tree.leaves(one["encoder"]), strict=True):
             np.testing.assert_allclose(left, right, rtol=1e-4, atol=1e-6)
-        assert sizes(one["heads"])["inverse_dynamics"] == 0
+        assert magnitudes(one["heads"])["inverse_dynamics"] == 0
 
 
 def test_the_ablation_compares_gradients_of_held_parameters():
@@ -274,7 +274,7 @@ def test_a_weighting_of_any_kind_trains_both_networks(weighting):
     for _ in range(2):
         before, (working, gradients, metrics) = working, update(working, batch)
     for network in (gradients.critic, gradients.actor):
-        assert all(size > 0 for size in sizes(network).values()) and all(np.isfinite(list(sizes(network).values())))
+        assert all(size > 0 for size in magnitudes(network).values()) and all(np.isfinite(list(magnitudes(network).values())))
     assert all(np.isfinite(value).all() for value in jax.tree.leaves(metrics))
     assert {f"train/weight/{name}" for name in ("main", *TWO)} <= set(metrics)
     assert jax.tree.structure(before.agent.weighting) == jax.tree.structure(working.agent.weighting)
@@ -289,7 +289,7 @@ def test_both_ways_to_a_gramian_train_alike():
 
 
 def test_a_main_loss_that_is_like_the_others_is_weighted_in_both_networks():
-    """`uniform` has a third of the sum's gradients; where weights are for encoders alone, heads learn as from the sum."""
+    """`uniform` yields a third of the sum's gradients; where weights are for encoders alone, heads learn as with the sum."""
     found = {}
     for weighting in ("sum", "uniform", "mgda"):
         _, update, working, batch = learner(aux_tasks=TWO, weighting=weighting)
@@ -305,7 +305,7 @@ def test_a_main_loss_that_is_like_the_others_is_weighted_in_both_networks():
         for network in ("critic", "actor"):
             one, other = (getattr(found[name], network)[part] for name in ("sum", "mgda"))
             jax.tree.map(assert_same, one, other)
-    assert sizes(found["mgda"].actor)["encoder"] < sizes(found["sum"].actor)["encoder"]
+    assert magnitudes(found["mgda"].actor)["encoder"] < magnitudes(found["sum"].actor)["encoder"]
 
 
 def test_learners_draw_apart():
@@ -357,7 +357,7 @@ def test_an_actor_learns_the_logarithm_of_value_and_penalty_together_where_asked
 
 
 def test_a_head_begins_alike_wherever_its_task_stands_in_the_list():
-    """Runs of the thesis's five tasks repeat themselves, and a task from elsewhere needs no place among them."""
+    """Keys of built-in heads depend neither on the order of tasks nor on user-defined ones, so that runs stay reproducible."""
     key = jax.random.key(3)
     made = list(auxtasks.make([*reversed(ALL)], auxtasks.Spec(SPEC, ACTIONS, 8)).values())
     new = [auxtasks.AuxTask(name, made[0].init, lambda *_: 0.0, lambda *_: 0.0) for name in ("new_one", "another")]

@@ -34,7 +34,7 @@ def make_spec(channels, size, latent_size=8, **sizes):
 
 
 def make_views(spec, batch):
-    """Random numbers wherever a loss may look, by task."""
+    """Return, by task, a view with random numbers in all fields that its loss may read."""
     keys = iter(jax.random.split(jax.random.key(0), 7))
     latents = {name: jax.random.normal(next(keys), (batch, spec.latent_size)).astype(spec.dtype) for name in LATENTS}
     action = jax.random.uniform(next(keys), (batch, spec.action_size), minval=-1.0)
@@ -146,8 +146,8 @@ def test_bfloat16_decodes_nearly_what_float32_does():
     assert 1e-4 < np.linalg.norm(found - expected) / np.linalg.norm(expected) < 2e-2
 
 
-def declared(task):
-    """The optional fields of a view that a task declares."""
+def declared_fields(task):
+    """Return the names of the optional fields of a view that a task declares."""
     own = {"latent_view": task.view, "target": task.view or task.target}
     return {*task.needs, *(field for field, maker in own.items() if maker is not None)}
 
@@ -157,7 +157,7 @@ def test_what_a_task_does_not_declare_may_be_left_out():
     everything = jax.eval_shape(lambda: make_views(spec, 2))
     for name, task in auxtasks.make(auxtasks.NAMES, spec).items():
         params = jax.eval_shape(task.init, jax.random.key(0))
-        fields = {field: getattr(everything[name], field) for field in declared(task)}
+        fields = {field: getattr(everything[name], field) for field in declared_fields(task)}
         bare = auxtasks.View(everything[name].latent_t, everything[name].action)
         assert jax.eval_shape(task.loss, params, bare.replace(**fields)).shape == ()
         for field in fields:
@@ -205,7 +205,7 @@ def test_tasks_that_show_states_have_no_auxiliary_tasks():
 
 @functools.cache
 def decoder_gradients(channels, dtype, implementation):
-    """Losses of both decoders and their gradients, by ``implementation``: products, kernel (interpreted) or plain; flat."""
+    """Return losses of both decoders and their gradients, flat. ``implementation``: products, kernel (interpreted) or plain."""
     spec = make_spec(channels, 32, latent_size=16, dtype=dtype, levels=3)
     tasks, views = auxtasks.make(("autoencoder", "optical_flow"), spec), make_views(spec, 4)
     view = views["autoencoder"]

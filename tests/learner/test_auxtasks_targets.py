@@ -1,4 +1,4 @@
-"""Targets of auxiliary tasks are what they say: an image turned by this angle, the speed of what moves."""
+"""Targets of auxiliary tasks are correct: the angle by which an image was rotated, the speed of moving objects."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ rotate = jax.jit(egomotion.rotate, static_argnames="border")
 
 
 def smooth_images(channels=2):
-    """[1, C, SIZE, SIZE] uint8 without sharp edges."""
+    """Return random images [1, C, SIZE, SIZE] uint8 without sharp edges."""
     noise = np.random.default_rng(0).uniform(size=(channels, SIZE, SIZE))
     smooth = scipy.ndimage.gaussian_filter(noise, (0, 2, 2))
     return np.uint8(255 * (smooth - smooth.min()) / np.ptp(smooth))[None]
@@ -58,7 +58,7 @@ def test_a_clipped_image_has_no_empty_corners():
 
 @pytest.mark.parametrize(("border", "max_shift"), [("clip", 0.0), ("zero", 0.1)])
 def test_the_motion_says_how_an_image_was_moved(border, max_shift):
-    """A spot to the right of the centre is where the angle and the shift put it."""
+    """A spot to the right of the centre appears where the angle and the shift move it."""
     batch, offset = 16, 7.0
     rows, columns = np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2
     spot = np.uint8(255 * np.exp(-(np.square(columns - offset) + np.square(rows)) / 4))
@@ -75,7 +75,7 @@ def test_the_motion_says_how_an_image_was_moved(border, max_shift):
 
 
 def test_the_strength_of_flow_is_that_of_the_newest_colours_that_move():
-    """A bright disc moves by two pixels, in the newest of two RGB-D images; depth and the older image do as they like."""
+    """A bright disc moves by two pixels, in the newest of two RGB-D images; depth and the older image are random."""
     rows, columns = np.mgrid[:SIZE, :SIZE]
     rng = np.random.default_rng(0)
 

@@ -1,4 +1,4 @@
-"""Contrastive RL: against a transcription, its goals, and what it learns without rewards."""
+"""Contrastive RL: comparison with a transcription, choice of goals, and learning without rewards."""
 
 import dataclasses
 
@@ -50,7 +50,7 @@ def setup(chosen, **changes):
 
 
 def numpy_head(head, inputs):
-    """A head in float64: one hidden layer, normalised if it has the parameters for that."""
+    """Apply a head in float64: one hidden layer, normalised if it has the parameters for that."""
     values = inputs @ head["hidden_0"]["kernel"] + head["hidden_0"]["bias"]
     if "normalization_0" in head:
         centred = values - values.mean(axis=1, keepdims=True)
@@ -83,7 +83,7 @@ def numpy_actor_loss(actor, critic, before, goal):
 
 
 def numpy_step(params, loss):
-    """The first step of Adam, with the gradient by differences in each direction."""
+    """Return parameters after the first step of Adam, with the gradient by central differences."""
     leaves, structure = jax.tree.flatten(params)
     moved = []
     for number, leaf in enumerate(leaves):

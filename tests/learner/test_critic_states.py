@@ -30,7 +30,7 @@ SETTINGS = {
 
 
 class Dark(probes.ThreeStepsAway):
-    """`ThreeStepsAway` in images that are always black; every other goal is out of reach."""
+    """`ThreeStepsAway` in images that are always black; the goals of half of the episodes are out of reach."""
 
     def start(self, key):
         return jnp.full(1, -3.0), 5.0 * jax.random.bernoulli(key, 0.5, (1,)).astype(jnp.float32)

@@ -45,7 +45,7 @@ def trained(env, iterations=12, **overrides):
 
 
 def values(program, train, observations, goals, action=0.0):
-    """The critic's values of [B] points and goals."""
+    """Return the critic's values of [B] points and goals."""
     networks = program.networks
 
     @jax.jit
@@ -169,7 +169,7 @@ def test_share_of_positives_is_the_one_derived(method, expected):
 
 
 def test_replay_is_written_in_place():
-    """The compiled iteration holds no second copy of the replay: it is aliased, and temporaries stay far below it."""
+    """The compiled iteration aliases the replay, and its temporary buffers are far smaller than a second copy."""
     config = preset("debug", replay_transitions=200_000, seeds=2)
     programs = Programs(config, make_train_step(probes.PointImage(), config))
     memory = programs.compiled("learn").memory_analysis()
@@ -194,7 +194,7 @@ def test_targets_follow_once_an_interval(interval, updates):
 
 
 def test_exploration_has_its_shares_and_spread():
-    """Whole vectors are uniform with the share asked for; the others stray from the policy with the deviation asked for."""
+    """Uniform actions have the requested share; the others deviate from the policy by the requested standard deviation."""
     program = make_train_step(probes.GoWhereTold(), preset("debug"))
     train = jax.tree.map(lambda leaf: np.asarray(leaf)[0], begin(program, KEYS).train)
     observations, count = jnp.zeros((20_000, 1)), 20_000
@@ -224,7 +224,7 @@ def test_success_counts_at_the_last_step():
     """A robot that passes through its goal and goes on has failed; one that arrives at the very end has not."""
 
     class Passing(probes.GoWhereTold):
-        """Moves by one a step, whatever the action; the goal is where it is after ``reached`` steps."""
+        """Probe that moves by one per step, whatever the action; the goal is its position after ``reached`` steps."""
 
         def __init__(self, reached):
             self.reached = reached
@@ -283,7 +283,7 @@ def test_saved_encoders_are_not_there(options):
 
 
 def test_policy_learns_from_images_with_fewer_encoders():
-    """It still goes where the goal image says; an actor that steps half as often needs longer."""
+    """The policy reaches the goals of goal images; an actor that steps half as often needs longer."""
     settings = {"encoder_filters": (8, 8), "relabel_probability": 0.9, "normalizer_floor": 1.0}
     program, train, _ = trained(probes.SeenGoWhereTold(), iterations=20, batch_size=32, **settings, **CHEAPER["all"])
     outcome, _ = program.evaluate(jax.tree.map(lambda leaf: leaf[None], train), jax.random.key(11))
@@ -317,7 +317,7 @@ def test_the_actor_steps_once_an_interval():
 
 
 def test_a_target_sums_the_rewards_of_several_steps():
-    """The critic needs no targets to know the value three steps away if it sums as many rewards as the episode has steps."""
+    """With targets that never learn, the critic learns the value three steps away from the sum of the episode's rewards."""
     program, train, _ = trained(probes.ThreeStepsAway(), n_step=4, target_decay=1.0, iterations=25)
     # Targets never learn: what they add is the fresh critic's value, which is near 0, after the episode's end.
     expected = [-1.0 - DISCOUNT, -1.0, 0.0]

@@ -15,7 +15,7 @@ flow = jax.jit(farneback.flow)
 
 
 def quantiles(found, expected):
-    """Median and 95th percentile of the end-point error, pixels, where the expected flow is at least 0.25 pixels."""
+    """Return median and 95th percentile of the end-point error, pixels, where the expected flow is at least 0.25 pixels."""
     is_moving = np.linalg.norm(expected, axis=-1) >= 0.25
     assert is_moving.sum() > 1000
     return np.quantile(np.linalg.norm(found - expected, axis=-1)[is_moving], [0.5, 0.95])

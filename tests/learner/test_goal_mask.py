@@ -71,13 +71,13 @@ def test_only_the_box_counts(images, method):
 
 
 def test_a_whole_image_hardly_shows_the_box(images):
-    """The box is less than the hundredth that the default tolerance_share forgives."""
+    """The box covers less of the image than the default tolerance_share, a hundredth."""
     assert reward(images["5 cm off"], images["goal"], "indicator_tolerance", mask=None) == 1.0
 
 
 @pytest.mark.parametrize("method", ["indicator", "indicator_tolerance"])
 def test_what_is_hidden_is_not_reached(images, method):
-    """A gripper before the box makes a false negative, never a false positive."""
+    """A gripper in front of the box causes a false negative, never a false positive."""
     hidden, goal = images["behind the gripper"], images["behind the gripper, goal"]
     assert 0 < object_mask(hidden).sum() < object_mask(goal).sum()
     assert reward(hidden, goal, method) == 0.0
@@ -100,7 +100,7 @@ def test_a_tolerance_counts_pixels_of_the_box(images):
 
 
 def test_a_learner_reads_the_mask(env, images, monkeypatch):
-    """A relabelled goal with the arm elsewhere is met, though images differ; the same without a mask is not."""
+    """With the mask, a relabelled goal is reached although the arm is elsewhere; without the mask, it is not."""
     config, built = preset("debug", env="VisualFetchPush", image_size=64, method="indicator"), []
     monkeypatch.setattr(train_step, "Sampler", lambda *parts: built.append(Sampler(*parts)) or built[-1])
     frames = [images[name] for name in ("5 cm off", "goal", "arm elsewhere", "arm elsewhere")]

@@ -1,4 +1,4 @@
-"""Goals of a task whose observed states show more than its goals are about."""
+"""Goals of a task whose observed states contain more than its goals specify."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ ENVS, HORIZON = 2, 4
 
 
 def test_relabelled_goals_tell_of_the_box_alone():
-    """FetchPush's own rule makes goals; where a goal is met, the indicator is positive wherever the arm is."""
+    """Goals are made by FetchPush's own `as_goal`; if the box is at its goal, the indicator is positive wherever the arm is."""
     env = jaxrl_vis_envs.make("FetchPush")
     observations = np.random.default_rng(0).uniform(0.3, 0.6, (ENVS, HORIZON + 2, 25)).astype(np.float32)
     observations[0, 3, 3:6] = observations[0, 2, 3:6]  # the box rests for a step, the arm does not

@@ -12,7 +12,7 @@ OPTIONS |= {"normalizer_floor": 1.0}
 
 
 def see(position, noise=0.0, draw=None):
-    """A bright column of 8x8 grey pixels where the point is, in [-1, 1], as a camera would send it: [8, 8, 1] uint8."""
+    """Return a camera image [8, 8, 1] uint8 of the point at ``position``, in [-1, 1]: a bright column."""
     column = np.arange(SIZE) - 3.5
     brightness = np.clip(255.0 * (1.0 - np.abs(column - 3.5 * position) / 2.0), 0.0, 255.0)
     image = np.broadcast_to(brightness, (SIZE, SIZE))
@@ -22,7 +22,7 @@ def see(position, noise=0.0, draw=None):
 
 
 def record(count, seed=0, noise=0.0, act=None):
-    """Episodes whose point goes where the action says: observations, actions, goals, and distances at the end."""
+    """Return episodes in which the point moves to the action: observations, actions, goals, and final distances."""
     draw = np.random.default_rng(seed)
     observations = np.zeros((count, HORIZON + 1, SIZE, SIZE, 1), np.uint8)
     actions, goals = np.zeros((count, HORIZON, 1), np.float32), np.zeros((count, SIZE, SIZE, 1), np.uint8)
@@ -127,7 +127,7 @@ def test_mistakes_get_one_line(tmp_path):
 
 
 def test_an_algorithm_of_ones_own_learns_from_recordings():
-    """Behaviour cloning works: actions in these episodes lead where the next image shows, whatever came before."""
+    """Behaviour cloning works, because each action leads to the position in the next image, whatever came before."""
     observations, actions, goals, _ = record(60)
     algorithm = "benchmarks.tasks.behaviour_cloning:make"
     learner = indicator.Learner((SIZE, SIZE, 1), 1, HORIZON, algorithm=algorithm, balance_probability=1.0, **OPTIONS)

@@ -1,4 +1,4 @@
-"""Learning without ground truth: rewards made of observations, their diagnostics, and what disturbs them."""
+"""Learning without ground truth: rewards computed from observations, their diagnostics, and what disturbs them."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ BEST = 1.0 / (1.0 - DISCOUNT)
 
 
 class StaysPut(probes.SeenGoWhereTold):
-    """The point stays where it starts, on either side; the goal is there, or on the other side."""
+    """Probe that stays at its start, on either side; the goal is the start or the point opposite."""
 
     def start(self, key):
         place_key, side_key, goal_key = jax.random.split(key, 3)
@@ -49,7 +49,7 @@ def with_autoencoder():
 
 
 def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):
-    """Nothing moves, so Q is the likeness of point and goal, paid for ever: 1 for equal ones, less across the image."""
+    """Nothing moves, so Q is the similarity of point and goal, received for ever: 1 for equal ones, less across the image."""
     program, train, metrics = with_autoencoder
     networks = program.networks
     points = np.linspace(0.45, 0.85, 8, dtype=np.float32)[:, None]
@@ -89,7 +89,7 @@ def test_likeness_is_a_cosine_that_is_cut_off_at_a_right_angle():
 
 
 def test_stacked_images_are_compared_as_goals():
-    """What was reached moved, and the goal stands still: alike in the newest image, they are alike."""
+    """The point has moved and the goal is static: they are equal if their newest images are."""
 
     class Stacked(StaysPut):
         frame_stack = 2
@@ -237,7 +237,7 @@ def test_false_rewards_have_their_shares_where_they_belong(clutter):
 
 @pytest.mark.parametrize("first", [0, 1, 2])
 def test_the_clutter_ends_where_the_share_of_stored_goals_does(first):
-    """The ring may also be written from another position than its beginning, as after a resumption without the replay."""
+    """The first rollout may lie anywhere in the ring, as after a resumption without the replay."""
     config = validate(preset("debug", reward_clutter=0.5, reward_false_positives=0.1))
     replay = Replay(num_rollouts=3, num_envs=2, horizon=5)
     state = replay.init(jax.ShapeDtypeStruct((2,), jnp.float32), goal_state_size=1, action_size=1)
@@ -264,7 +264,7 @@ def test_errors_of_the_estimator_show_in_the_diagnostics():
 
 
 class StillImage(probes.SeenGoWhereTold):
-    """Nothing moves, so that without noise all frames are equal."""
+    """Probe that never moves, so that all frames are equal without noise."""
 
     def start(self, key):
         return jnp.zeros(1), jnp.zeros(1)

@@ -1,4 +1,4 @@
-"""The encoder is the convolution stack that it says it is; statistics are those of the whole data."""
+"""The encoder is a plain stack of convolutions, and statistics are those of the whole data."""
 
 import functools
 
@@ -54,7 +54,7 @@ def encoder_case(shape, batch: int, first: int, dtype):
 
 
 class EncoderCase:
-    """Latents of some images and gradients of a weighted sum of them, by each of the implementations."""
+    """Latents of random images and gradients of a weighted sum of them, by each of the implementations."""
 
     def __init__(self, shape, batch, which, dtype):
         config = preset("fast", encoders="separate", latent_size=16, compute_dtype=dtype)
@@ -63,7 +63,7 @@ class EncoderCase:
         rng = np.random.default_rng(0)
 
         def drawn(path, leaf):
-            """Kernels like fresh ones, and biases that matter."""
+            """Return random kernels of the size of fresh ones, and biases that are not negligible."""
             window = 4 if "kernel_" in str(path) else 1
             most = np.sqrt(6 / (leaf.shape[0] + window * leaf.shape[1])) if len(leaf.shape) > 1 else 0.0
             return jnp.asarray(rng.uniform(-most, most, leaf.shape) + rng.normal(0, 0.05, leaf.shape), jnp.float32)
@@ -76,7 +76,7 @@ class EncoderCase:
         self.probe = jnp.asarray(rng.normal(size=(batch - which.start, 16)), jnp.float32)
 
     def latents_and_gradient(self, implementation):
-        """``implementation``: products (of `networks`), kernel (by Pallas's interpreter) or plain (the kernel's other half)."""
+        """Return both. ``implementation``: products (`networks`), kernel (in Pallas's interpreter) or plain (without a GPU)."""
         if implementation not in self._found:
             self._found[implementation] = self._latents_and_gradient(implementation)
         return self._found[implementation]
@@ -119,7 +119,7 @@ def test_the_gpu_kernel_computes_and_differentiates_the_same_function(shape, bat
 
 @pytest.mark.parametrize("implementation", ["products", "kernel", "plain"])
 def test_encoders_are_differentiated_forwards_where_tangents_are_wanted(implementation, monkeypatch):
-    """A tangent is the gradient's product with its direction, whichever implementation makes the gradient."""
+    """A tangent is the inner product of the gradient and its direction, whichever implementation computes the gradient."""
     case = encoder_case(*SHAPES[2], "float32")
     _, gradient = case.latents_and_gradient(implementation)
     if implementation != "products":
@@ -169,7 +169,7 @@ def test_images_move_alike_whoever_prepares_them(implementation, monkeypatch):
 
 
 def test_in_bfloat16_the_gpu_kernel_is_as_near_to_float32_as_plain_products_are():
-    """Both round; neither is the truth. Errors are those of the whole leaf, relative to its float32 value."""
+    """Both round, so float32 is the reference. Errors are those of whole leaves, relative to their float32 values."""
     shape, batch, first = (4, 32, 32), 16, 0
     truth = encoder_case(shape, batch, first, "float32").latents_and_gradient("products")
     case = encoder_case(shape, batch, first, "bfloat16")

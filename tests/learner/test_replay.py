@@ -1,4 +1,4 @@
-"""The replay and the relabelling, on episodes whose every entry says where it belongs."""
+"""Replay and relabelling, on episodes in which every entry encodes its episode and slot."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ HORIZON, ENVS = 5, 3
 
 
 def encoded_rollout(first_episode: int) -> Episodes:
-    """Episodes whose frames, states and actions hold (episode id, slot)."""
+    """Return episodes whose frames, states and actions hold (episode id, slot)."""
     episode = jnp.arange(first_episode, first_episode + ENVS)
     slots = jnp.arange(HORIZON + 2)
     both = jnp.stack(jnp.broadcast_arrays(episode[:, None], slots[None]), axis=-1)  # [E, T+2, 2]
@@ -84,7 +84,7 @@ def test_transitions_are_sampled_evenly():
 
 @pytest.mark.parametrize("rollouts", [2, 8])
 def test_older_transitions_are_sampled_as_seldom_as_asked_for(rollouts):
-    """Ages fall exponentially, over what is stored: as where each new episode takes the place of a random one."""
+    """Probabilities decrease exponentially with age among stored episodes, as if each new episode replaced a random one."""
     capacity, mean_age = 6, 2
     replay = make_replay(capacity * ENVS * HORIZON, ENVS, HORIZON, mean_age=mean_age * ENVS * HORIZON)
     state = replay.init(jax.ShapeDtypeStruct((2, 4, 4), jnp.uint8), goal_state_size=2, action_size=2)

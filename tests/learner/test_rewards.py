@@ -1,4 +1,4 @@
-"""Rewards beside the oracle's and the autoencoder's: with tolerance, of a frozen encoder, of a classifier trained along."""
+"""Rewards other than the oracle's and the autoencoder's: with tolerance, of a frozen encoder, of a classifier in training."""
 
 import functools
 
@@ -23,7 +23,7 @@ from jaxrl_vis_envs import goals
 
 
 def pair(reached, goal):
-    """A batch of which only what was reached and the goals matter."""
+    """Return a batch in which only the reached observations and the goals matter."""
     nothing = jnp.zeros((len(goal), 1))
     return Batch(jnp.stack([goal, goal, reached]), nothing, nothing, nothing)
 
@@ -52,7 +52,7 @@ def with_classifier():
 
 
 def test_a_classifier_tells_goals_from_what_is_not_there():
-    """Half of the goals are where the point is and stays, so a pair of equal images is worth about 1, and another nothing."""
+    """Half of the goals are where the point is and stays, so pairs of equal images get about 1, and others about 0."""
     program, train, metrics = with_classifier()
     networks = program.networks
     points = np.linspace(0.45, 0.85, 8, dtype=np.float32)[:, None]

@@ -1,4 +1,4 @@
-"""Training and evaluation in parts, as a CPU plays them: the same as all environments at once."""
+"""Training and evaluation in parts, as on a CPU, give the results of all environments at once."""
 
 import functools
 import math
@@ -37,7 +37,7 @@ def programs(program: TrainStep) -> Programs:
 
 @pytest.fixture(scope="module")
 def whole(program: TrainStep) -> Programs:
-    """Return the programs for a GPU: all environments are played at once, and an evaluation has a program of its own."""
+    """Programs for a GPU, which plays all environments at once and has a separate program for evaluations."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(train_step, "targets_cpu", lambda: False)
         return Programs(CONFIG, make_train_step(program.env, CONFIG))

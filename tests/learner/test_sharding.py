@@ -1,4 +1,4 @@
-"""Several devices: seeds that lie on them, and parts of one learner; what is refused; what one part owes to the others."""
+"""Several devices: distribution of seeds, division of one learner, refusals, and what the parts exchange."""
 
 import functools
 import json
@@ -67,7 +67,7 @@ def test_environments_start_and_explore_alike_on_however_many_devices(found: dic
 
 
 def test_a_run_goes_on_with_another_number_of_devices(found: dict[str, Any]) -> None:
-    """Parameters, optimisers and replay are restored to the bit, and lie where they are to lie."""
+    """Parameters, optimisers and replay are restored bit for bit, each on the intended devices."""
     assert found["restored"] == {
         "1 devices, None along data": [[], [1]],
         "2 devices, 1 along data": [[], [2]],
@@ -127,7 +127,7 @@ def test_memory_is_asked_of_each_device(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 class _Elsewhere:
-    """A layout on accelerators that are not here."""
+    """Layout on accelerators that are not present."""
 
     def __init__(self, devices: int, parts: int):
         self.num_devices, self.shards, self.mesh = devices, Shards(parts), object()
@@ -135,7 +135,7 @@ class _Elsewhere:
 
 
 def in_parts(function, count: int, *arrays):
-    """Calls a function with parts of arrays, side by side, as devices would; each part's result along a new first axis."""
+    """Call a function with parts of arrays in parallel, as devices would; results of parts are along a new first axis."""
     parts = [array.reshape(count, -1, *array.shape[1:]) for array in arrays]
     return jax.jit(jax.vmap(lambda *part: function(Shards(count), *part), axis_name=DATA))(*parts)
 
@@ -152,7 +152,7 @@ def test_statistics_of_parts_are_those_of_the_whole() -> None:
 
 
 def test_each_part_takes_its_own_transitions_of_a_batch() -> None:
-    """Numbers are drawn for the whole learner, so that a batch in two parts has all those that one part would have."""
+    """Numbers are drawn for the whole learner, so that the two parts of a batch have those of an undivided one."""
     config = validate(preset("debug", batch_size=12))
     replay = Replay(num_rollouts=2, num_envs=3, horizon=5)
     state = ReplayState(Episodes(*(jnp.zeros((6, 7, 2)) for _ in range(3))), jnp.int32(6))
@@ -193,7 +193,7 @@ def make_steps(config: Config, shards: Shards) -> GradientSteps:
 
 
 def make_learner(config: Config) -> TrainState:
-    """A fresh one that has seen a few images."""
+    """Return a fresh learner that has seen a few images."""
     agent = make_steps(config, Shards()).init(jax.random.key(1))
     statistics = normalizer.update(normalizer.init(SPEC), jnp.arange(1024.0).reshape(2, 1, 2, 16, 16) % 200)
     # As high as the filter's threshold, so that it drops some transitions and keeps others.
@@ -204,7 +204,7 @@ def make_learner(config: Config) -> TrainState:
 
 
 def gradients(config: Config, shards: Shards, train: TrainState, batch: Batch) -> Any:
-    """Gradients and metrics."""
+    """Return the gradients and metrics of a batch."""
     steps = make_steps(config, shards)
     working = steps.begin(train.agent, train.statistics)
     return steps.gradients(working, steps.prepare(working, batch), True)

@@ -1,4 +1,4 @@
-"""TD3: against a transcription, in probes with known answers, and with all else that DDPG learns with."""
+"""TD3: comparison with a transcription, probes with known answers, and combinations with the other options of DDPG."""
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ def draw_batches():
 
 
 def numpy_td3(agent, batches, noise, resolved):
-    """Four gradient steps, of which the second and the fourth move actor and targets: actor, critics, targets."""
+    """Return actor, critics and their targets after four steps, of which the second and the fourth move actor and targets."""
     actor, critics = layers(agent.actor["head"]), [layers(agent.critic["head"], number) for number in (0, 1)]
     target_actor, targets = actor, list(critics)
     of_actor, of_critics = Adam(RATE), [Adam(RATE), Adam(RATE)]

@@ -1,4 +1,4 @@
-"""Steps of the scalar engine with boxes, one of them free. NumPy does the arithmetic: compiling it for a CPU takes a minute."""
+"""Steps of the scalar engine with boxes, one of them free, in NumPy, because compilation for a CPU takes a minute."""
 
 import contextlib
 from collections.abc import Iterator
@@ -53,7 +53,7 @@ BOXES = """
 
 @contextlib.contextmanager
 def lanes_of_numpy() -> Iterator[None]:
-    """Lets NumPy do the arithmetic of lanes, in double precision."""
+    """Let NumPy compute the arithmetic of lanes, in double precision, within the context."""
     lax = SimpleNamespace(fori_loop=loop_of_numpy, while_loop=open_loop_of_numpy)
     with arithmetic_of(np), pytest.MonkeyPatch.context() as patch:
         for module in (box_faces, lane_newton, lane_rows, box_steps):
@@ -66,7 +66,7 @@ def lanes_of_numpy() -> Iterator[None]:
 
 
 def step_of(mj_model: mujoco.MjModel, drawn: dict[str, np.ndarray]) -> JointState:
-    """A step of N states, [N, nq] and [N, nv]; with as many iterations as it needs."""
+    """Return N states, [N, nq] and [N, nv], after a step with as many iterations as it needs."""
     with jax.enable_x64(True):  # or MJX rounds the model
         model = box_model.build_box_model(mjx.put_model(mj_model))
     model = model._replace(tree=model.tree._replace(iterations=50))
@@ -84,7 +84,7 @@ def step_of(mj_model: mujoco.MjModel, drawn: dict[str, np.ndarray]) -> JointStat
 
 
 def drawn_states(count: int) -> dict[str, np.ndarray]:
-    """States of `BOXES`: the box on the table or up to 1 mm above it, the finger on top of the box or beside it."""
+    """Return states of `BOXES`: the box on the table or up to 1 mm above it, the finger on top of the box or beside it."""
     rng = np.random.default_rng(0)
     mj_model = mujoco.MjModel.from_xml_string(BOXES)
     data, qpos = mujoco.MjData(mj_model), np.empty((count, 9))
@@ -126,7 +126,7 @@ def test_a_step_is_that_of_mujoco():
 
 
 def test_a_step_of_the_push():
-    """Steps are compared with C MuJoCo's less the weld's term, in which boxes also touch with edges."""
+    """Steps are compared with C MuJoCo's less the weld's term; some differ, because boxes also touch with edges there."""
     env = environments.make("FetchPush")
     visited = one_step.push_states(env)
     place = env.mj_model.joint("box").qposadr[0]
@@ -140,7 +140,7 @@ def test_a_step_of_the_push():
 
 
 def lowered_push(exact: bool | None) -> str:
-    """The program of a control step of the push for NVIDIA GPUs."""
+    """Return the program of a control step of the push, lowered for NVIDIA GPUs."""
     env = environments.make("FetchPush")
     data = jax.eval_shape(lambda: jax.vmap(lambda _: mjx.make_data(env.mj_model))(jnp.zeros(8)))
 

@@ -22,7 +22,7 @@ ROWS = ((0, 1, 2, 3), (1,), (3,), (0, 1, 2, 3), *[(0, 1, 2, 3)] * 3)
 
 
 class Arrays(NamedTuple):
-    """A problem of `MASS` and `ROWS` in matrices, or a batch of them: see `scalar_newton.Problem`."""
+    """Problem with `MASS` and `ROWS` as matrices, or a batch of problems; see `scalar_newton.Problem`."""
 
     mass: np.ndarray
     force: np.ndarray
@@ -36,7 +36,7 @@ class Arrays(NamedTuple):
 
 
 def problems(count: int, seed: int = 0) -> Arrays:
-    """Random ones, float64: an equality, dry friction, a limit, a contact without friction, and one with."""
+    """Return random problems, float64: an equality, dry friction, a limit, and contacts without and with friction in each."""
     rng = np.random.default_rng(seed)
     roots = rng.normal(size=(count, JOINTS, JOINTS))
     mass = roots @ roots.transpose(0, 2, 1) + 0.5 * np.eye(JOINTS)
@@ -58,7 +58,7 @@ def problems(count: int, seed: int = 0) -> Arrays:
 
 
 def in_scalars(arrays: Arrays) -> Problem:
-    """One problem."""
+    """Return one problem with scalar entries."""
     return Problem(
         mass={place: arrays.mass[place] for place in MASS},
         force=list(arrays.force),
@@ -74,7 +74,7 @@ def in_scalars(arrays: Arrays) -> Problem:
 
 
 def cost(problem: Arrays, acceleration: np.ndarray) -> tuple[float, str]:
-    """The cost of one problem, as MuJoCo's documentation has it, and where the contact is: free, stuck or sliding."""
+    """Return the cost of one problem by MuJoCo's documentation, and the state of the contact: free, stuck or sliding."""
     x = problem.jacobian @ acceleration - problem.target
     total = 0.5 * acceleration @ problem.mass @ acceleration - problem.force @ acceleration
     squares = 0.5 * problem.stiffness * x**2
@@ -153,7 +153,7 @@ def test_a_matrix_that_fills_in_is_divided_by():
 
 
 def test_dry_friction_is_not_jumped_over():
-    """The slope turns within a thousandth of the line, between two flat stretches whose own zeros are outside of it."""
+    """The slope rises within two thousandths of the line, between two almost flat parts whose own zeros are outside of it."""
 
     def slope_at(length):
         knee = jnp.clip(1000.0 * (length - 0.3), -1.0, 1.0)
@@ -217,7 +217,7 @@ def test_most_constraints_of_the_hand_tie_few_joints():
 def test_a_problem_of_the_hand_is_solved():
     """The hand has 24 joints: contacts fill in the factorization of a tree.
 
-    NumPy does the arithmetic, in float32, too: to compile it takes minutes, and JAX takes ten seconds for it scalar by scalar.
+    NumPy computes it, in float32, too: compilation takes minutes, and JAX without compilation takes ten seconds.
     """
     structure = problem_of_the_hand()
     rng = np.random.default_rng(3)

@@ -1,6 +1,6 @@
 """Physics steps of the scalar engine, and their GPU kernel, which Pallas's interpreter runs here.
 
-For a whole step of the hand NumPy does the arithmetic, in float32, too: to compile it for a CPU takes minutes.
+Whole steps of the hand are computed by NumPy, in float32, too, because compilation for a CPU takes minutes.
 """
 
 import contextlib
@@ -92,7 +92,7 @@ def odd_model(warmstart: str = "enable") -> mujoco.MjModel:
 
 
 class Float32Numpy:
-    """NumPy's functions, for which plain numbers have no type of their own, as in JAX."""
+    """NumPy's functions, in which Python's numbers do not determine the dtype, as in JAX."""
 
     inf = np.inf
 
@@ -125,7 +125,7 @@ def branch_of_numpy(condition, one, other):
 
 @contextlib.contextmanager
 def arithmetic_of(numpy: Any) -> Iterator[None]:
-    """Lets NumPy, or what behaves like it, do the arithmetic of the scalar engine."""
+    """Let NumPy, or an object with its functions, compute the arithmetic of the scalar engine within the context."""
     arithmetic = (constraint_softness, contacts, friction_cones, line_search, partial_arithmetic, quaternions)
     arithmetic += (scalar_newton, sparse_algebra, steps, welds)
     with pytest.MonkeyPatch.context() as patch, np.errstate(over="ignore"):
@@ -137,8 +137,8 @@ def arithmetic_of(numpy: Any) -> Iterator[None]:
         yield
 
 
-def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: Any = True) -> steps.JointState:
-    """`steps.simulate` of a batch, [B, N] each, in NumPy."""
+def simulate_in_numpy(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: Any = True) -> steps.JointState:
+    """Return the states [B, N] of a batch after `steps.simulate` in NumPy."""
     constants = scalar_model.build_scalar_model(model)
     used = list(constants.mocaps)
     mocap = np.concatenate([data.mocap_pos[:, used], data.mocap_quat[:, used]], axis=2).reshape(data.qpos.shape[0], -1)
@@ -152,7 +152,7 @@ def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: 
 
 @functools.cache
 def steps_by_matrices(name: str):
-    """Function of a batch and a number of steps; the number is an argument, so that one program takes any."""
+    """Return a function of a batch and a number of steps; the number is an argument, so that one program serves any number."""
     env = environments.make(name)
 
     def one_step(_: Any, data: mjx.Data) -> mjx.Data:
@@ -167,13 +167,13 @@ def by_matrices(name: str, count: int):
 
 
 def repeated(data: mjx.Data, count: int) -> mjx.Data:
-    """Return ``count`` copies, made on the host: on a device, each size of leaf would be a program to compile."""
+    """Return ``count`` copies, made on the host, because a device would need a program for each size of leaf."""
     return jax.tree.map(lambda leaf: np.tile(leaf, (count,) + (1,) * leaf.ndim), jax.device_get(data))
 
 
 @functools.cache
 def states(name: str) -> mjx.Data:
-    """48 episodes in the middle of a control step, after three random ones."""
+    """Return the states of 48 episodes in the middle of a control step, after three random ones."""
     env = environments.make(name)
     rng = np.random.default_rng(0)
     actions = jnp.asarray(rng.uniform(-1, 1, (4, 48, env.action_size)), jnp.float32)
@@ -199,7 +199,7 @@ def test_a_step_of_each_task_is_that_of_matrices(name):
     after = one_step(data)
     touching = (np.asarray(after._impl.contact.dist) < 0).sum(axis=1)
     assert (touching == 0).sum() > 5 and (touching > 0).sum() > 2
-    state = taken(env._model, data, 1, in_kernel=True)
+    state = simulate_in_numpy(env._model, data, 1, in_kernel=True)
     assert state.acceleration.dtype == np.float32
     # Rounding errors of float32, 1e-7 of what cancels, times the condition of the mass matrix and of stiff contacts.
     scale = np.abs(np.asarray(after.qacc)).max(axis=1)
@@ -214,7 +214,7 @@ def test_a_control_step_of_each_task_is_that_of_matrices(name):
     data = states(name)
     env, _ = by_matrices(name, 1)
     _, control_step = by_matrices(name, env.config.substeps)
-    after, state = control_step(data), taken(env._model, data, env.config.substeps, in_kernel=False)
+    after, state = control_step(data), simulate_in_numpy(env._model, data, env.config.substeps, in_kernel=False)
     error = np.abs(state.position - np.asarray(after.qpos)).max(axis=1)
     # A contact that begins one step later changes more than rounding errors do.
     assert np.median(error) < 2e-6 and error.max() < 1e-3, np.sort(error)[-5:]
@@ -261,7 +261,7 @@ def test_a_step_of_a_model_with_everything(warmstart):
     after = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.step(model, data, True)))(data)
     contact = np.asarray(after._impl.contact.dist) - np.asarray(after._impl.contact.includemargin)
     assert ((contact < 0).sum(axis=0) > 10).all() and ((contact < 0).sum(axis=1) > 1).sum() > 10
-    state = taken(model, data, 1, in_kernel=warmstart == "disable")
+    state = simulate_in_numpy(model, data, 1, in_kernel=warmstart == "disable")
     scale = np.abs(np.asarray(after.qacc)).max(axis=1)
     error = np.abs(state.acceleration - np.asarray(after.qacc)).max(axis=1) / scale
     assert np.median(error) < 2e-6 and error.max() < 1e-3, np.sort(error)[-10:]
@@ -271,7 +271,7 @@ REACHER_SUBSTEPS = 10
 
 
 def reacher_states(count: int) -> mjx.Data:
-    """The reacher at random velocities and torques, half of the elbows within a step of the limit, on either side of it."""
+    """Return states at random velocities and torques, half of the elbows within a step of the limit, on either side of it."""
     rng = np.random.default_rng(6)
     elbow = np.concatenate(
         [rng.uniform(-2.5, 2.5, count // 2), rng.choice([-1, 1], count // 2) * rng.uniform(2.9, 3.05, count // 2)]
@@ -336,7 +336,7 @@ def test_the_kernel_of_runge_kutta_takes_the_steps_of_mjx():
         np.testing.assert_allclose(getattr(ours, name), getattr(after, name), rtol=1e-3, atol=1e-2)
     # One step, also beside MJX's own.
     theirs = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx.step(env._model, data)))(data)
-    ours = taken(env._model, data, 1, in_kernel=True, exact=False)
+    ours = simulate_in_numpy(env._model, data, 1, in_kernel=True, exact=False)
     np.testing.assert_allclose(ours.position, theirs.qpos, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(ours.velocity, theirs.qvel, rtol=1e-5, atol=1e-5)
 
@@ -364,7 +364,7 @@ def test_joints_without_constraints_beside_others(integrator):
 def test_whether_steps_are_exact_may_be_a_number(is_exact):
     mj_model = odd_model()
     model, data = mjx.put_model(mj_model), odd_states(mj_model, 50)
-    known, read = (taken(model, data, 2, in_kernel=True, exact=exact) for exact in (is_exact, np.int32(is_exact)))
+    known, read = (simulate_in_numpy(model, data, 2, in_kernel=True, exact=exact) for exact in (is_exact, np.int32(is_exact)))
     for one, other in zip(known, read, strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -440,7 +440,7 @@ def test_the_kernel_takes_the_same_steps():
 
 
 def lowered_for_cuda(model: mjx.Model, data: mjx.Data) -> str:
-    """The program of a control step for NVIDIA GPUs, without one."""
+    """Return the program of a control step, lowered for NVIDIA GPUs without one."""
 
     def control_step(data):
         with tracing_for("cuda"), kernels(True):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from test_steps import columns, lowered_for_cuda, taken
+from test_steps import columns, lowered_for_cuda, simulate_in_numpy
 
 import jaxrl_vis_envs
 from benchmarks.tasks import environments
@@ -94,7 +94,7 @@ def odd_states(mj_model: mujoco.MjModel, count: int) -> mjx.Data:
 
 @functools.cache
 def by_matrices(name: str):
-    """The task, and its physics steps as they are without kernels: one program for any number of them."""
+    """Return the task, and its physics steps without kernels: one program for any number of them."""
     env = environments.make(name)
 
     def steps_of(data, count):
@@ -132,7 +132,7 @@ def test_a_step_of_a_model_with_everything(in_kernel):
     after = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.step(model, data, True)))(data)
     contact = np.asarray(after._impl.contact.dist) - np.asarray(after._impl.contact.includemargin)
     assert ((contact < 0).sum(axis=0) >= 10).all(), (contact < 0).sum(axis=0)
-    state = taken(model, data, 1, in_kernel, exact=True)
+    state = simulate_in_numpy(model, data, 1, in_kernel, exact=True)
     scale = np.abs(np.asarray(after.qacc)).max(axis=1)
     error = np.abs(state.acceleration - np.asarray(after.qacc)).max(axis=1) / scale
     assert np.median(error) < 2e-6 and error.max() < 1e-3, np.sort(error)[-10:]
@@ -146,7 +146,7 @@ def test_a_step_of_each_task_is_that_of_matrices(name):
     if name != "SawyerReach":
         touching = (np.asarray(after._impl.contact.dist - after._impl.contact.includemargin) < 0).sum(axis=1)
         assert (touching == 0).sum() > 5 and (touching > 0).sum() > 5
-    state = taken(env._model, data, 1, in_kernel=True, exact=False)
+    state = simulate_in_numpy(env._model, data, 1, in_kernel=True, exact=False)
     assert state.acceleration.dtype == np.float32
     # Rounding errors of float32, 1e-7 of what cancels: stiff welds and contacts, whose forces nearly balance.
     scale = np.abs(np.asarray(after.qacc)).max(axis=1)
@@ -160,7 +160,7 @@ def test_a_step_of_each_task_is_that_of_matrices(name):
 def test_a_control_step_of_each_task_is_that_of_matrices(name):
     env, step = by_matrices(name)
     after = step(states(name), env.config.substeps)
-    state = taken(env._model, states(name), env.config.substeps, in_kernel=True, exact=False)
+    state = simulate_in_numpy(env._model, states(name), env.config.substeps, in_kernel=True, exact=False)
     error = np.abs(state.position - np.asarray(after.qpos)).max(axis=1)
     # A contact that begins one step later changes more than rounding errors do.
     assert np.median(error) < 1e-6 and error.max() < 1e-4, np.sort(error)[-5:]

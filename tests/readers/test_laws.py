@@ -1,4 +1,4 @@
-"""Laws of the mathematics, for numbers that nobody chose: each function is compiled once and asked many times."""
+"""Mathematical properties, for arbitrary numbers: each function is compiled once and called many times."""
 
 import functools
 import math
@@ -35,7 +35,7 @@ def replay_programs(mean_age: int | None):
 
 @pytest.mark.parametrize("mean_age", [None, ENVS * HORIZON])
 def test_replays_give_what_was_put_in(mean_age):
-    """From any beginning in the ring, transitions are of stored episodes alone, whole, and with goals of their own episode."""
+    """Wherever the ring begins, sampled transitions are complete, of stored episodes, and with goals of their own episode."""
     _, empty, insert, sample, gather, is_stored = replay_programs(mean_age)
 
     @given(st.integers(0, 1000), st.integers(1, 5), seeds, st.data())
@@ -110,7 +110,7 @@ def rule(name):
 
 @pytest.mark.parametrize("name", sorted(RULES))
 def test_weights_are_finite_not_negative_and_nobodys_by_name(name):
-    """The law holds for any losses and products of gradients; losses that exchange names exchange their weights."""
+    """Losses and products of gradients are arbitrary; losses that exchange names exchange their weights."""
 
     @given(
         st.lists(st.tuples(*[losses] * 4), min_size=3, max_size=3),
@@ -172,7 +172,7 @@ rays_of = jax.jit(lambda scene: (lens(scene), pixel_rays(scene, *np.indices((12,
 
 @given(st.floats(1, 170, width=32))
 def test_lenses_of_an_angle_of_view_are_pinholes(fovy):
-    """The middle of the image looks ahead, opposite pixels look opposite ways, and the outer edge is half the angle away."""
+    """The central ray points ahead, rays of opposite pixels are opposite, and the outer edge is at half the angle."""
     scene = scene_of('fovy="50"').replace(fovy=jnp.float32(fovy))
     (across, up, half_u, half_v), (u, v) = jax.device_get(rays_of(scene))
     assert across == up == 0.0
@@ -186,7 +186,7 @@ def test_lenses_of_an_angle_of_view_are_pinholes(fovy):
 
 @given(*[st.floats(0.005, 0.1)] * 2, *[st.floats(-0.01, 0.01)] * 2)
 def test_lenses_of_a_sensor_put_its_principal_point_ahead(focal_x, focal_y, right, down):
-    """Rays are those of the camera's matrix: u = (column - c) / f, in pixels, which the sensor's size converts to metres."""
+    """Rays are those of the camera's matrix: u = (column - c) / f, in pixels; the sensor's size converts pixels to metres."""
     scene = scene_of('focal=".02 .02" sensorsize=".03 .02" resolution="20 12"')
     scene = scene.replace(focal=jnp.float32([focal_x, focal_y]), principal=jnp.float32([right, down]))
     _, (u, v) = jax.device_get(rays_of(scene))

@@ -1,4 +1,4 @@
-"""What somebody else's files and names must not do: each case once ended the program, filled the memory, or went by untold."""
+"""Files and names from outside that once ended the program, filled the memory or went unreported."""
 
 import csv
 import json
@@ -103,7 +103,7 @@ def test_pairs_of_one_name_are_told(tmp_path, names, told):
         find_plots(tmp_path)
 
 
-def test_what_macos_leaves_beside_images_is_no_pair(tmp_path):
+def test_what_macos_leaves_beside_images_is_not_a_pair(tmp_path):
     for name in ("left_0.png", "right_0.png", "._left_0.png", "._right_0.png", "left_².png"):
         (tmp_path / name).touch()
     assert [pair.name for pair in find_plots(tmp_path)[0].pairs] == ["0", "²"]

@@ -1,4 +1,4 @@
-"""What readers of files from outside say of cases that spoilt files (test_readers.py) seldom come to, one by one."""
+"""Reports of the readers of files from outside in cases that corrupted files (test_readers.py) seldom reach, one by one."""
 
 import json
 import os

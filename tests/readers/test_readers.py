@@ -1,7 +1,7 @@
-"""Law of all readers of files from outside: whatever the bytes, a value or one line of an error of one's own, soon, in 200 MB.
+"""Every reader of external files returns a value or raises its own one-line error, for any bytes, in 1 s of CPU and 200 MB.
 
-Valid files are spoilt (`mutations`) and read in another process (`readers_worker`), so that a crash is told as one. Of each
-kind at least a third of the examples come past the parser. `make fuzz` tries many more, and other ones each time.
+Valid files are corrupted (`mutations`) and read in another process (`readers_worker`), so that a crash is reported as one. At
+least a third of the examples of each kind get past the parser. `make fuzz` tries many more, and other ones each time.
 """
 
 import base64
@@ -31,7 +31,10 @@ def worker() -> Iterator[Worker]:
 
 
 def hold(worker: Worker, name: str, files: st.SearchStrategy[Files], refuses: bool = True) -> None:
-    """Asserts the law for many spoilt files, of which a third come past the parser, and some are read and some ``refuses``."""
+    """Check that reader ``name`` reads or refuses corrupted files within the limits of time and memory.
+
+    At least a third must get past the parser, some must be read and, if ``refuses``, some refused.
+    """
     tally: Counter[str] = Counter()
 
     @given(files)
@@ -57,7 +60,7 @@ def written(text: st.SearchStrategy[str]) -> st.SearchStrategy[bytes]:
 
 
 def also_as_text(tree: st.SearchStrategy[str], valid: str) -> st.SearchStrategy[bytes]:
-    """Spoilt trees, and now and then a text that was spoilt as one."""
+    """Return corrupted trees, and now and then a text that was corrupted as text."""
     return st.one_of(written(tree), written(tree), texts(valid))
 
 
@@ -76,9 +79,9 @@ ROS = {"image_width": 640, "image_height": 480, "projection_matrix": {"rows": 3,
 
 
 def test_calibrations_of_opencv(worker):
-    spoilt = st.sampled_from((OPENCV, PLAIN)).flatmap(trees)
-    as_yaml = also_as_text(spoilt.map(lambda tree: "%YAML:1.0\n---\n" + yaml_text(tree)), "%YAML:1.0\n" + yaml_text(OPENCV))
-    as_json = also_as_text(spoilt.map(json_text), json_text(OPENCV))
+    corrupted = st.sampled_from((OPENCV, PLAIN)).flatmap(trees)
+    as_yaml = also_as_text(corrupted.map(lambda tree: "%YAML:1.0\n---\n" + yaml_text(tree)), "%YAML:1.0\n" + yaml_text(OPENCV))
+    as_json = also_as_text(corrupted.map(json_text), json_text(OPENCV))
     as_xml = also_as_text(trees(OPENCV).map(_opencv_xml), '<?xml version="1.0"?>\n' + _opencv_xml(OPENCV))
     hold(worker, "calibration", st.one_of(named("rig.yaml", as_yaml), named("rig.json", as_json), named("rig.xml", as_xml)))
 
@@ -101,7 +104,7 @@ def test_calibrations_of_ros(worker):
 
 
 def _lines(tree, mark: str) -> str:
-    """A table of names and values as programs print it, a line each."""
+    """Return a table of names and values as programs print it, one per line."""
     return "".join(f"{name}{mark}{value}\n" for name, value in tree.items()) if isinstance(tree, dict) else str(tree)
 
 
@@ -178,14 +181,14 @@ COCO = {
 def test_boxes_and_outlines_of_coco(worker):
     single = {**COCO, "annotations": [{"image_id": 1, "bbox": [10, 10, 16, 30]}]}
     outlined = {**COCO, "annotations": [{"image_id": 1, "segmentation": [[10, 10, 26, 10, 20, 40, 12, 40]]}]}
-    spoilt = st.sampled_from((COCO, single, outlined)).flatmap(trees).map(json_text)
-    hold(worker, "coco", named("annotations.json", also_as_text(spoilt, json_text(COCO))))
+    corrupted = st.sampled_from((COCO, single, outlined)).flatmap(trees).map(json_text)
+    hold(worker, "coco", named("annotations.json", also_as_text(corrupted, json_text(COCO))))
 
 
 def test_masks_of_coco(worker):
     each = [{**COCO, "annotations": [annotation]} for annotation in COCO["annotations"][1:]]
-    spoilt = st.sampled_from(each).flatmap(lambda data: st.tuples(st.just(data), trees(data["annotations"], 2)))
-    changed = spoilt.map(lambda both: json_text({**both[0], "annotations": both[1]}))
+    corrupted = st.sampled_from(each).flatmap(lambda data: st.tuples(st.just(data), trees(data["annotations"], 2)))
+    changed = corrupted.map(lambda both: json_text({**both[0], "annotations": both[1]}))
     hold(worker, "coco", named("annotations.json", also_as_text(changed, json_text(each[0]))))
 
 
@@ -205,8 +208,8 @@ def test_annotations_of_pascal_voc(worker):
             head.format
         )
     )
-    spoilt = st.tuples(declare_shapes, trees(VOC).map(lambda tree: xml_text(tree, "annotation"))).map("".join)
-    hold(worker, "voc", named("a.xml", also_as_text(spoilt, text)))
+    corrupted = st.tuples(declare_shapes, trees(VOC).map(lambda tree: xml_text(tree, "annotation"))).map("".join)
+    hold(worker, "voc", named("a.xml", also_as_text(corrupted, text)))
 
 
 LABELME = {
@@ -327,7 +330,7 @@ def _disparities() -> dict[str, bytes]:
     return {name: cv2.imencode(name[1:], values.astype(kind))[1].tobytes() for name, kind in kinds.items()}
 
 
-def _spoilt_images(valid: dict[str, bytes]) -> st.SearchStrategy[Files]:
+def _corrupted_images(valid: dict[str, bytes]) -> st.SearchStrategy[Files]:
     return st.one_of(
         named(name, pngs(data) | blobs(data, 33) if name.endswith(".png") else blobs(data, 64)) for name, data in valid.items()
     )
@@ -338,8 +341,8 @@ def test_images(worker):
     right = st.sampled_from(
         (b"", valid["a.png"], valid["a.jpg"], valid["a16.png"], cv2.imencode(".png", np.zeros((5, 5)))[1].tobytes())
     )
-    both = st.tuples(_spoilt_images(valid), right).map(lambda two: {**two[0], "right.png": two[1]})
-    hold(worker, "image", _spoilt_images(valid) | both)
+    both = st.tuples(_corrupted_images(valid), right).map(lambda two: {**two[0], "right.png": two[1]})
+    hold(worker, "image", _corrupted_images(valid) | both)
 
 
 _WORDS = (
@@ -385,13 +388,13 @@ def test_names_of_images(worker):
 
 
 def test_disparities(worker):
-    hold(worker, "disparity", _spoilt_images(_disparities()))
+    hold(worker, "disparity", _corrupted_images(_disparities()))
 
 
 # --- weights ---
 @st.composite
 def safetensors(draw: st.DrawFn, arrays: dict[str, np.ndarray], about: dict) -> bytes:
-    """Settings spoilt as a tree; or the header with names, shapes, types and places; or bytes."""
+    """Draw a file with corrupted settings, or a corrupted header (names, shapes, types and offsets), or corrupted bytes."""
     kind = draw(st.sampled_from(("about", "about", "header", "bytes")))
     if kind == "about":
         return save(arrays, {"about": json_text(draw(trees(about, 2)))})
@@ -443,8 +446,9 @@ def test_families(worker):
         "layout": {"stalks_mean": 5, "plot_length": 0.5},
         "stalks": {"lean_sd": [0, 3.5]},
     }
-    spoilt = st.sampled_from((whole, few, few)).flatmap(trees)
-    as_json, as_toml = also_as_text(spoilt.map(json_text), json_text(few)), also_as_text(spoilt.map(toml_text), toml_text(few))
+    corrupted = st.sampled_from((whole, few, few)).flatmap(trees)
+    as_json = also_as_text(corrupted.map(json_text), json_text(few))
+    as_toml = also_as_text(corrupted.map(toml_text), toml_text(few))
     hold(worker, "family", named("mine.json", as_json) | named("mine.toml", as_toml))
 
 

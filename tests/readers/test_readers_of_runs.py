@@ -1,4 +1,4 @@
-"""The law of `test_readers`, for what lies in a run's folder."""
+"""Every reader of files in a run's folder returns a value or raises its own error, like those of `test_readers`."""
 
 import json
 import shutil
@@ -20,8 +20,8 @@ def test_configurations(worker, tmp_path):  # noqa: F811
     folder = RunFolder(tmp_path / "run")
     folder.open(Config(), log=("tensorboard",))
     valid = json.loads(folder.config.read_text())
-    spoilt = trees(valid, 2) | trees(valid["config"], 2).map(lambda config: {**valid, "config": config})
-    hold(worker, "config", named("config.json", also_as_text(spoilt.map(json_text), json_text(valid))))
+    corrupted = trees(valid, 2) | trees(valid["config"], 2).map(lambda config: {**valid, "config": config})
+    hold(worker, "config", named("config.json", also_as_text(corrupted.map(json_text), json_text(valid))))
 
 
 ROWS = [
@@ -38,7 +38,7 @@ def test_metrics(worker):  # noqa: F811
 
 
 def test_manifests_of_checkpoints(states, saved):  # noqa: F811
-    """A checkpoint whose manifest is spoilt is used where it can be, or left out with a line, or refused in one."""
+    """A checkpoint with a corrupted manifest is used where possible, or left out with a line, or refused with one line."""
     shutil.rmtree(saved / FULL)
     (file,) = [path for path in (saved / LIGHT / "3" / "manifest").iterdir() if "progress" in path.read_text(errors="replace")]
     valid = json.loads(file.read_text())

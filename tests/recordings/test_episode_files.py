@@ -191,8 +191,8 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
         convert.check_out(folder, "lerobot")
     video = folder / "videos/observation.images.camera/chunk-000/file-000.mp4"
     whole = video.read_bytes()
-    for spoilt in (whole[: len(whole) // 2], b"", b"no video"):
-        video.write_bytes(spoilt)
+    for corrupted in (whole[: len(whole) // 2], b"", b"no video"):
+        video.write_bytes(corrupted)
         with pytest.raises(RequestError, match="dataset") as refusal:
             convert.read(folder)
         assert "\n" not in str(refusal.value)

@@ -32,9 +32,7 @@ BALL_XML = """
 
 
 def poses_of(data, batch: int | None = None) -> dict:
-    """Return the poses in MjData that the renderer reads, as a dictionary that vmap accepts; with ``batch``, repeated that many
-    times.
-    """
+    """Return the poses in MjData that the renderer reads, for vmap: a dictionary, repeated ``batch`` times if that is given."""
     poses = {name: np.array(getattr(data, name), np.float32) for name in POSES}
     return poses if batch is None else {name: np.repeat(value[None], batch, 0) for name, value in poses.items()}
 

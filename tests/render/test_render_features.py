@@ -28,7 +28,7 @@ def load(body: str, header: str = FLAT_LIGHT, assets: str = ""):
 
 
 def drawn(body: str, camera: str = "above", size: int = 17, header: str = FLAT_LIGHT, assets: str = "", **options):
-    """Render an image as NumPy arrays, with normals and distance."""
+    """Render a scene of ``body`` as NumPy arrays, with normals and distance."""
     mj_model, mj_data = load(body, header, assets)
     scene = Scene.from_mjmodel(mj_model, camera, size, size, **options)
     return shown(scene, mj_data)
@@ -36,7 +36,7 @@ def drawn(body: str, camera: str = "above", size: int = 17, header: str = FLAT_L
 
 @jaxrl_vis_envs.jit
 def draw(scene: Scene, poses: dict):
-    """Render; compiled once for all scenes that differ only in numerical values."""
+    """Render with normals and distance; compiled once for all scenes that differ only in numerical values."""
     return render(scene, SimpleNamespace(**poses), normals=True, distance=True)
 
 

@@ -168,7 +168,7 @@ def test_gradients_match_finite_differences(name):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_nan_pose_does_not_spoil_other_gradients(name):
+def test_nan_pose_does_not_corrupt_other_gradients(name):
     """The last object has a NaN pose; gradients of the whole image with respect to floor, camera and lights stay finite."""
     _, poses, measure = setting(name)
     poses = poses | {"geom_xpos": poses["geom_xpos"].at[-1].set(jnp.nan)}

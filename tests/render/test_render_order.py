@@ -42,9 +42,7 @@ RED, BLUE = np.array([0.9, 0.1, 0.2]), np.array([0.1, 0.2, 0.9])
 
 
 def load(body: str, floor: str = FLOOR) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Return model and data after forward kinematics of a scene over a grey floor, with a texture whose left half is
-    transparent.
-    """
+    """Load a scene over a grey floor, with a texture whose left half is transparent; return the model and its poses."""
     pixels = np.full((8, 8, 4), [200, 100, 50, 255], np.uint8)
     pixels[:, :4, 3] = 0
     file = io.BytesIO()
@@ -178,7 +176,7 @@ def test_paper_among_many_geoms_stays_on_the_desk(papers, way, monkeypatch):
 
 
 def test_smoothing_threshold_matches_float32_rounding():
-    """The cosine of their angle is exactly MuJoCo's threshold for smooth shading: float32 rounding decides."""
+    """The cosine of the angle between faces is exactly MuJoCo's threshold for smooth shading: float32 rounding decides."""
     ridge = "-.2 0 0 .2 0 0 -.2 .8 .6 .2 .8 .6 -.2 1.6 0 .2 1.6 0 -.2 .8 -.05 .2 .8 -.05"
     faces = "0 1 3 0 3 2 2 3 5 2 5 4 0 6 7 0 7 1 4 5 7 4 7 6 0 2 6 2 4 6 1 7 3 3 7 5"
     xml = f"""<mujoco><asset><mesh name="ridge" vertex="{ridge}" face="{faces}"/></asset>

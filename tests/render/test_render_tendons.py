@@ -69,14 +69,14 @@ def model_of(name: str, gravity: str = "0 0 -9.81") -> mujoco.MjModel:
 
 
 def visualized(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> list[Any]:
-    """The tendons' geoms of MuJoCo's visualiser."""
+    """Return the geoms of tendons in MuJoCo's visualiser."""
     scene, option, camera = mujoco.MjvScene(mj_model, 200), mujoco.MjvOption(), mujoco.MjvCamera()
     mujoco.mjv_updateScene(mj_model, mj_data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
     return [geom for geom in scene.geoms[: scene.ngeom] if geom.objtype == mujoco.mjtObj.mjOBJ_TENDON]
 
 
 def distances(points: np.ndarray, lines: np.ndarray) -> np.ndarray:
-    """Distances [P] of points [P, 3] to the nearest of the lines [L, 2, 3] between two points."""
+    """Return the distances [P] of points [P, 3] to the nearest of the lines [L, 2, 3] between two points."""
     along = lines[:, 1] - lines[:, 0]
     offset = points[:, None] - lines[None, :, 0]
     shares = np.clip(np.sum(offset * along, axis=-1) / np.sum(along * along, axis=-1), 0.0, 1.0)

@@ -27,7 +27,7 @@ FAKE = Path(__file__).parents[1] / "fake_program.py"
 
 @pytest.fixture(scope="module")
 def states():
-    """Loop states after 1, 2 and 3 iterations of the fake program, and its shapes."""
+    """Loop states after 1, 2 and 3 iterations of the fake program, and the program's shapes."""
     trainer = make_fake_trainer(small_config(), None)
     loop, snapshots = trainer.init(jax.random.key(7)), []
     for _ in range(3):
@@ -38,7 +38,7 @@ def states():
 
 @pytest.fixture(scope="module")
 def saved_once(states, tmp_path_factory):
-    """A folder with full checkpoints of iterations 1 to 3, of which orbax keeps 2 and 3, and light ones likewise."""
+    """Folder in which full and light checkpoints of iterations 1 to 3 were saved; orbax keeps 2 and 3 of both."""
     folder = tmp_path_factory.mktemp("saved") / "checkpoints"
     checkpoints = Checkpoints(folder)
     for iteration, loop in enumerate(states[0], start=1):
@@ -50,7 +50,7 @@ def saved_once(states, tmp_path_factory):
 
 @pytest.fixture
 def saved(saved_once, tmp_path):
-    """A copy of that folder, to do with as one likes."""
+    """Copy of `saved_once`, which tests may change."""
     return shutil.copytree(saved_once, tmp_path / "checkpoints")
 
 
@@ -141,7 +141,7 @@ def test_a_damaged_checkpoint_is_skipped_with_one_line(states, saved, how, capfd
 
 
 def test_complaints_about_a_damaged_checkpoint_that_come_late_are_not_shown(states, saved, monkeypatch):
-    """Threads that were reading it may fail when the reading has been given up, and the checkpoints are closed."""
+    """Threads that read a checkpoint may fail after reading was given up and the checkpoints were closed."""
     shown = []
     monkeypatch.setattr(sys, "unraisablehook", lambda unraisable: shown.append(str(unraisable.exc_value)))
 
@@ -255,7 +255,7 @@ def test_kill_while_saving_keeps_the_checkpoint_before(tmp_path, clean_environme
 
 
 def test_a_checkpoint_that_is_still_being_written_is_not_written_twice(tmp_path, monkeypatch):
-    """A signal comes right after the light checkpoint of an iteration was begun, and the disk is slow."""
+    """A signal arrives right after saving of a light checkpoint has begun on a slow disk."""
     save, iterations, saved = Checkpoints._save, Checkpoints.iterations, []
 
     def complete(checkpoints, tier):

@@ -1,4 +1,4 @@
-"""`jaxrl-vis encoder`: an encoder that has learned something, and what uses it."""
+"""`jaxrl-vis encoder`: training of an encoder, and its use for rewards."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`jaxrl-vis export`: what leaves acts as what stays, and says so when it does not."""
+"""`jaxrl-vis export`: exported policies act as those of the runs, or an error reports that they do not."""
 
 import dataclasses
 import importlib
@@ -39,7 +39,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def exported(runs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], Path]:
-    """Folder of each run in each format."""
+    """Folder of each run's exported policy in each format."""
     folder = tmp_path_factory.mktemp("files")
     with pytest.MonkeyPatch.context() as monkeypatch:
         register(monkeypatch)
@@ -51,7 +51,7 @@ def exported(runs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) ->
 
 @pytest.fixture
 def copied(exported: dict[tuple[str, str], Path], tmp_path: Path) -> Any:
-    """A copy of an exported policy, to be spoilt."""
+    """Function that copies an exported policy, to be corrupted."""
 
     def copy(kind: str, name: str = "VisualTold") -> Path:
         return Path(shutil.copytree(exported[name, kind], tmp_path / name / kind))
@@ -115,7 +115,7 @@ def test_a_camera_task_describes_its_image(monkeypatch: pytest.MonkeyPatch, runs
 
 
 def made(name: str, **changes: Any) -> tuple[Any, ...]:
-    """A policy of the networks of a preset, with parameters and statistics at random, and a batch of inputs."""
+    """Return a policy of the networks of a preset, with random parameters and statistics, and a batch of inputs."""
     config = preset(name, compute_dtype="float32", **changes)
     channels = {"rgbd": 4, "rgb": 3, "depth": 1}[config.environment.pixels]
     size = config.environment.image_size

@@ -53,8 +53,8 @@ def test_a_damaged_line_makes_the_goodput_unknown_and_is_kept(tmp_path, damage):
     assert total.goodput is None and "unknown" in total.describe(3) and total.resumes == 1
 
 
-def left_after(config, path, iteration: int) -> None:
-    """A run that stops after a report without a word, as if it were killed."""
+def abandon_run(config, path, iteration: int) -> None:
+    """Abandon a run after the report of ``iteration``, without an end, as if it were killed."""
     trainer = make_fake_trainer(config, path, resume=path.exists())
     for report in trainer.run():
         if report.iteration == iteration:
@@ -63,7 +63,7 @@ def left_after(config, path, iteration: int) -> None:
 
 def test_a_run_that_was_killed_says_what_it_lost(straight, tmp_path, capsys):
     path, config = tmp_path / "run", small_config(full_checkpoint_interval=0)
-    left_after(config, path, 3)
+    abandon_run(config, path, 3)
     first = read_processes(path / "processes.jsonl")[0].begun
     saved = Checkpoints(path / "checkpoints").newest()
     assert 3 <= first <= 4 and saved >= 2
@@ -79,7 +79,7 @@ def test_a_run_that_was_killed_says_what_it_lost(straight, tmp_path, capsys):
 def test_a_lost_replay_is_counted_each_time(tmp_path, capsys):
     path, config = tmp_path / "run", small_config(full_checkpoint_interval=0)
     for iteration in (3, 6):
-        left_after(config, path, iteration)
+        abandon_run(config, path, iteration)
         Checkpoints(path / "checkpoints").recent.clear()
     list(make_fake_trainer(config, path, resume=True).run())
     out = capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""`play --live`: what a person asks for on the page reaches the robot, and what the robot does reaches the page."""
+"""`play --live`: requests on the page reach the robot, and the page shows the robot's motion."""
 
 import dataclasses
 import socket
@@ -32,7 +32,7 @@ SETTINGS = {"num_envs": 2, "hidden_sizes": (8,), "replay_transitions": 40, "batc
 
 
 class Placed(point_mass.PointMass):
-    """The ball, whose goal can be put anywhere near its start."""
+    """Point mass whose goal can be placed anywhere near its start."""
 
     def __init__(self, config: point_mass.PointMassConfig):
         super().__init__(config)
@@ -47,7 +47,7 @@ class Placed(point_mass.PointMass):
 
 @pytest.fixture(scope="module")
 def policy() -> Iterator[Policy]:
-    """A policy that has learned nothing."""
+    """Policy of an untrained learner."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(registry._ENTRIES, "VisualPoint", registry._Entry(Placed, point_mass.PointMassConfig))
         config = jaxrl_vis.preset("debug", env="VisualPoint", pixels="rgbd", image_size=8, latent_size=8, **SETTINGS)
@@ -105,7 +105,7 @@ class Handle(types.SimpleNamespace):
 
 
 class Server:
-    """Stand-in for the part of `viser.ViserServer` that a page uses. viser itself is tried where it is installed, below."""
+    """Stand-in for the part of `viser.ViserServer` that a page uses. A test below uses viser itself, if it is installed."""
 
     def __init__(self) -> None:
         self.added: dict[str, Handle] = {}

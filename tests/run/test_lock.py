@@ -22,7 +22,7 @@ DEAD = 2**22 + 1  # a process of this number there cannot be, on Linux
 
 @pytest.fixture
 def no_locks(monkeypatch):
-    """A file system without locks, and holders that are taken for dead soon."""
+    """File system without locks, on which holders count as dead after a second."""
 
     def refuse(*_):
         raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
@@ -33,7 +33,7 @@ def no_locks(monkeypatch):
 
 
 def marker(host: str, process: int) -> str:
-    """Returns the lock file of a holder on a file system without locks."""
+    """Return the contents of a holder's lock file on a file system without locks."""
     return f"filelock/2\npid={process}\nhost={host}\nmode=lease\ntoken={'0' * 32}\nduration=1.0\n"
 
 
@@ -150,7 +150,7 @@ def test_of_two_that_start_at_once_one_wins(tmp_path, no_locks, leftover):
 
 
 def test_a_file_without_words_is_waited_for(tmp_path, no_locks):
-    """A holder makes its file and then writes into it, unless it dies in between."""
+    """A holder creates its file and then writes into it, unless it dies in between."""
     path = tmp_path / FILE_NAME
     path.touch()
     writing = threading.Timer(0.3, path.write_text, [marker("elsewhere", 7)])

@@ -1,4 +1,4 @@
-"""`--log tensorboard wandb`: what the libraries' own files hold afterwards. Nothing here needs a network or an account."""
+"""`--log tensorboard wandb`: contents of the libraries' own files afterwards. No network and no account is needed."""
 
 import json
 import shutil
@@ -29,7 +29,7 @@ def offline(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def events(folder: Path) -> list[Any]:
-    """Everything in TensorBoard's files in ``folder``, which are records with lengths and checksums."""
+    """Return all events in TensorBoard's files in ``folder``, which are records with lengths and checksums."""
     results = []
     for file in sorted(folder.glob("events.out.tfevents.*")):
         data, place = file.read_bytes(), 0
@@ -45,7 +45,7 @@ def read_curve(folder: Path, tag: str) -> list[tuple[int, float]]:
 
 
 def records(file: Path) -> list[Any]:
-    """Everything in a .wandb file."""
+    """Return all records in a .wandb file."""
     data, place, part, results = file.read_bytes(), 7, b"", []
     while place + 7 <= len(data):
         left = BLOCK - place % BLOCK
@@ -62,7 +62,7 @@ def records(file: Path) -> list[Any]:
 
 
 def wandb_runs(path: Path) -> dict[int, list[dict[str, Any]]]:
-    """Seed -> the history of its runs, in the order of the parts they were written in."""
+    """Return the history of each seed's runs, in the order in which their files were written."""
     results: dict[int, list[dict[str, Any]]] = {}
     ids = json.loads((path / "wandb.json").read_text())
     for seed, known in ids.items():
@@ -81,14 +81,14 @@ def expected(path: Path, seed: int, name: str) -> list[tuple[int, float]]:
 
 
 def assert_shown(path: Path, seed: int, name: str) -> None:
-    """TensorBoard shows a figure as metrics.jsonl has it, each evaluation once."""
+    """Check that TensorBoard shows a metric as metrics.jsonl does, each evaluation once."""
     curve, there = read_curve(path / "tensorboard" / f"seed{seed}", name), expected(path, seed, name)
     assert [step for step, _ in curve] == [step for step, _ in there] and there
     assert [value for _, value in curve] == pytest.approx([value for _, value in there])
 
 
 def check_all(path: Path) -> None:
-    """Both loggers show each evaluation of both seeds once, as metrics.jsonl has it."""
+    """Check that both loggers show each evaluation of both seeds once, as metrics.jsonl does."""
     runs = wandb_runs(path)
     for seed in (0, 1):
         for name in ("eval/success", "train/critic_loss"):
@@ -120,7 +120,7 @@ def test_both_show_what_the_run_has_written(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_resumed_run_shows_each_evaluation_once(tmp_path: Path) -> None:
-    """The run is abandoned after iteration 7 and resumed from 3: rows after 3 are written again. Loggers go on unasked."""
+    """The run is abandoned after iteration 7 and resumed from 3: rows after 3 are written again, by the same loggers."""
     path = tmp_path / "run"
     config = small_config(full_checkpoint_interval=3, checkpoint_interval=3)
     for report in make_fake_trainer(config, path, log=("wandb", "tensorboard")).run():

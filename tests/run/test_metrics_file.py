@@ -1,4 +1,4 @@
-"""metrics.jsonl, whatever a disk or somebody has made of it."""
+"""metrics.jsonl, including files that a disk or a user has damaged."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""The best checkpoint, an early end and callbacks; resumed runs have the same ones as runs without interruption."""
+"""Best checkpoint, early stopping and callbacks, which are the same in resumed as in uninterrupted runs."""
 
 import json
 from collections.abc import Callable
@@ -28,7 +28,7 @@ PEAK = 4  # iteration after which evaluations become worse
 
 
 class Peak(FakeProgram):
-    """A learner whose success rises up to an iteration, and falls after it."""
+    """Program whose success rises up to an iteration, and falls after it."""
 
     def __init__(self, config: Config):
         super().__init__(config)
@@ -43,7 +43,7 @@ class Peak(FakeProgram):
 
 @pytest.fixture(scope="module")
 def make() -> Callable[..., Trainer]:
-    """Makes trainers of this learner, which is compiled once."""
+    """Function that makes trainers of this program, which is compiled once."""
     first = Trainer(small_config(), Peak(small_config()))
     first.compile()
 
@@ -189,7 +189,7 @@ def test_a_run_killed_at_its_early_end_ends_there(straight: Path, make: Callable
     assert {row["iteration"] for row in rows_without_time(path)} == {2, PEAK} and best(path) == [PEAK]
 
 
-def test_a_level_that_is_no_success_is_refused() -> None:
+def test_a_level_that_is_not_a_success_rate_is_refused() -> None:
     with pytest.raises(RequestError, match="stop_at 95 can never be reached: success is from 0 to 1"):
         validate(small_config(stop_at=95.0))
     with pytest.raises(RequestError, match="best_by"):

@@ -1,4 +1,4 @@
-"""`play --aux`: what auxiliary tasks predict, drawn."""
+"""`play --aux`: drawings of what auxiliary tasks predict."""
 
 import dataclasses
 from pathlib import Path
@@ -25,7 +25,7 @@ SETTINGS |= {"encoder_filters": (4, 4), "latent_size": 8, "checkpoint_interval":
 
 
 class Dots(probes.GoWhereTold):
-    """A point as a pattern that brightens: depth, 18 rows and 16 columns, of which an encoder of two layers sees 16."""
+    """Probe observed as a depth image [1, 18, 16] whose brightness is the position; an encoder of two layers sees 16 rows."""
 
     def __init__(self, _: Any = None) -> None:
         self.pattern = jnp.asarray(np.random.default_rng(0).uniform(0, 100, (1, 18, 16)), jnp.float32)
@@ -42,7 +42,7 @@ def dots():
 
 
 def save_fresh_learner(folder: Path, **changes: Any) -> Path:
-    """A run folder with a checkpoint of what a run begins with: gradient steps would take longest to compile."""
+    """Write a run folder with a checkpoint of a fresh learner, because gradient steps would take longest to compile."""
     config = jaxrl_vis.preset("debug", env="VisualDots", **{**SETTINGS, **changes})
     trainer = jaxrl_vis.make_trainer(config, folder)
     trainer.folder.open(config)
@@ -95,7 +95,7 @@ def test_a_run_shows_what_it_predicts(
 def test_what_cannot_be_shown_is_refused_in_one_line(
     changes: dict, words: list[str], parts: list[str], here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The configuration alone decides: nothing was trained here, and nothing is compiled."""
+    """The configuration suffices: nothing was trained here, and nothing is compiled."""
     folder = here / "run"
     config = jaxrl_vis.preset("debug", env="VisualDots", **{**SETTINGS, **changes})
     jaxrl_vis.make_trainer(config, folder).folder.open(config)
@@ -117,7 +117,7 @@ def make_predictions(channels: int, steps: int = 2, size: int = 16) -> tuple[vid
 
 @pytest.mark.parametrize(("channels", "columns", "rows"), [(1, 6, 1), (3, 6, 1), (4, 5, 2)])
 def test_tiles_stand_side_by_side(channels: int, columns: int, rows: int) -> None:
-    """Flow and predicted flow share a column where colour and depth stand below each other."""
+    """Flow and predicted flow share a column if colour and depth are above each other."""
     episodes, predictions = make_predictions(channels)
     images, seconds = auxiliary_video.draw_frames(episodes, predictions, 0.05)
     assert len(images) == 2 and seconds == [0.05, videos.HOLD]

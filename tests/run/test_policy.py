@@ -1,4 +1,4 @@
-"""`jaxrl_vis.load_policy`: what a run has learned, used elsewhere."""
+"""`jaxrl_vis.load_policy`: policies of runs, used elsewhere."""
 
 import dataclasses
 import re
@@ -26,7 +26,7 @@ SETTINGS |= {"encoder_filters": (4,), "latent_size": 8, "checkpoint_interval": 1
 
 
 class Seen(probes.GoWhereTold):
-    """A point as an image of two channels, 4 rows and 6 columns, with noise of its own in every pixel."""
+    """Probe observed as an image [2, 4, 6]: a random pattern that brightens with the position."""
 
     def __init__(self, _: Any = None) -> None:
         self.pattern = jnp.asarray(np.random.default_rng(0).uniform(0, 100, (2, 4, 6)), jnp.float32)
@@ -48,20 +48,20 @@ def register(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A state task and an image task that compile at once."""
+    """A state task and an image task that compile quickly."""
     register(monkeypatch)
 
 
 @pytest.fixture(scope="module")
 def policies(runs: dict[str, Path]) -> dict[str, jaxrl_vis.Policy]:
-    """The first seed of each run."""
+    """Policies of the first seed of each run."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         register(monkeypatch)
         return {name: jaxrl_vis.load_policy(run) for name, run in runs.items()}
 
 
 def played(run: Path) -> Any:
-    """Episodes [S, 5, ...] that the learner itself plays with the newest checkpoint."""
+    """Return episodes [S, 5, ...] that the learner itself plays with the newest checkpoint."""
     trainer = open_run(run)
     train = load(trainer, run).train
     keys = jnp.stack([jax.random.key(0)] * len(trainer.seeds))

@@ -1,4 +1,4 @@
-"""`jaxrl-vis push` and `dataset`: what leaves a run folder, and that it comes back."""
+"""`jaxrl-vis push` and `dataset`: what they publish from a run folder, and loading it again."""
 
 import json
 import sys
@@ -24,7 +24,7 @@ from jaxrl_vis.run.trained.restored_run import evaluate_run
 
 @pytest.fixture(autouse=True)
 def told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A state task that compiles at once."""
+    """A state task that compiles quickly."""
     register(monkeypatch)
 
 
@@ -41,7 +41,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def pushed(run: Path) -> Path:
-    """The policy of its second seed, pushed."""
+    """Folder to which the policy of the second seed was pushed."""
     folder = run.parent / "policy"
     with pytest.MonkeyPatch.context() as monkeypatch:
         register(monkeypatch)

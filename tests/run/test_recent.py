@@ -1,4 +1,4 @@
-"""The state that is kept for a process that is killed: exact, written once, checked, and never in the way."""
+"""Recent states, which resume a process that was killed: exact, written once, checked, and never an obstacle."""
 
 import errno
 import shutil
@@ -20,7 +20,7 @@ NO_OTHERS = {"full_checkpoint_interval": 0, "checkpoint_interval": 100}
 
 @pytest.fixture(scope="module")
 def states():
-    """Loop states after 1 to 7 iterations of the fake program, by iteration, and its shapes."""
+    """Loop states after 1 to 7 iterations of the fake program, by iteration, and the program's shapes."""
     trainer = make_fake_trainer(small_config(), None)
     loop, states_at = trainer.init(jax.random.key(7)), {}
     for iteration in range(1, 8):
@@ -145,7 +145,7 @@ def test_no_room_is_said_once_and_ends_nothing(states, tmp_path, monkeypatch):
     assert not (tmp_path / RECENT).exists()
 
 
-def left_after(config, path, iteration: int, **options) -> None:
+def abandon_run(config, path, iteration: int, **options) -> None:
     for report in make_fake_trainer(config, path, resume=path.exists(), **options).run():
         if report.iteration == iteration:
             return
@@ -153,14 +153,14 @@ def left_after(config, path, iteration: int, **options) -> None:
 
 @pytest.fixture
 def always(monkeypatch):
-    """A state after every iteration."""
+    """Keep a state after every iteration."""
     monkeypatch.setattr(recent, "_FRACTION", np.inf)
 
 
 @pytest.mark.parametrize("after", [1, 3, 4, 7])
 def test_a_run_that_is_killed_goes_on_exactly(straight, tmp_path, always, capsys, after):
     path, config = tmp_path / "run", small_config(**NO_OTHERS)
-    left_after(config, path, after)
+    abandon_run(config, path, after)
     assert Checkpoints(path / "checkpoints").iterations(RECENT)[-1] in (after, after + 1)
     list(make_fake_trainer(config, path, resume=True).run())
     out = capsys.readouterr().out
@@ -172,7 +172,7 @@ def test_a_run_that_is_killed_goes_on_exactly(straight, tmp_path, always, capsys
 def test_a_run_that_is_killed_again_and_again_goes_on_exactly(straight, tmp_path, always):
     path, config = tmp_path / "run", small_config(**NO_OTHERS)
     for after in (2, 4, 5, 7):
-        left_after(config, path, after)
+        abandon_run(config, path, after)
     list(make_fake_trainer(config, path, resume=True).run())
     assert rows_without_time(path) == rows_without_time(straight[0])
 
@@ -195,7 +195,7 @@ def test_killed_in_an_evaluation_it_is_evaluated_again(straight, tmp_path, alway
 
 def test_a_damaged_one_is_kept_and_the_one_before_is_used(straight, tmp_path, always, capsys):
     path, config = tmp_path / "run", small_config(**NO_OTHERS)
-    left_after(config, path, 5)
+    abandon_run(config, path, 5)
     newest = Checkpoints(path / "checkpoints").iterations(RECENT)[-1]
     flip(path / "checkpoints" / RECENT / f"{newest}.state", -1)
     list(make_fake_trainer(config, path, resume=True).run())
@@ -208,14 +208,14 @@ def test_a_damaged_one_is_kept_and_the_one_before_is_used(straight, tmp_path, al
 def test_a_light_checkpoint_is_never_newer(tmp_path, monkeypatch):
     monkeypatch.setattr(recent, "_FRACTION", 1e-9)  # next to never by the clock
     path, config = tmp_path / "run", small_config(full_checkpoint_interval=0)
-    left_after(config, path, 5)
+    abandon_run(config, path, 5)
     checkpoints = Checkpoints(path / "checkpoints")
     assert checkpoints.iterations(RECENT)[-1] == checkpoints.iterations(LIGHT)[-1] == 4
 
 
 def test_a_full_checkpoint_takes_its_place(straight, tmp_path, always):
     path, config = tmp_path / "run", small_config(**NO_OTHERS)
-    left_after(config, path, 3)
+    abandon_run(config, path, 3)
     list(make_fake_trainer(config.replace(full_checkpoint_interval=3), path, resume=True).run())
     assert Checkpoints(path / "checkpoints").iterations(FULL) == [6, 8] and not (path / "checkpoints" / RECENT).exists()
     assert rows_without_time(path) == rows_without_time(straight[0])

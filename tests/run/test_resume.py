@@ -1,4 +1,4 @@
-"""Going on with a run, or not: what is kept, what is refused, what is said."""
+"""Resumption of runs: what is kept, what is refused, and what is reported."""
 
 import errno
 import json
@@ -151,15 +151,15 @@ def test_an_earlier_run_outlives_a_new_one_that_cannot_be(straight, tmp_path):
     assert before == {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
 
 
-def interrupted(config, path, after: int) -> None:
-    """A run that SIGTERM ends after iteration ``after``, with a light and a full checkpoint."""
+def interrupt_run(config, path, after: int) -> None:
+    """End a run by SIGTERM after iteration ``after``, with a light and a full checkpoint."""
     run_until_sigterm(make_fake_trainer(config, path), after)
 
 
 def test_a_stale_full_checkpoint_destroys_nothing(tmp_path, capsys):
-    """The run gets SIGTERM, is resumed to the end, and then for more: the second part's checkpoints and rows stay."""
+    """The run gets SIGTERM, is resumed to its end, and then extended: the second part's checkpoints and rows stay."""
     path, config = tmp_path / "run", small_config(full_checkpoint_interval=0, env_steps=200)
-    interrupted(config, path, 2)
+    interrupt_run(config, path, 2)
     checkpoints = Checkpoints(path / "checkpoints")
     saved_at = checkpoints.iterations(FULL)
     assert len(saved_at) == 1 and checkpoints.iterations(LIGHT)[-1] == saved_at[0]
@@ -180,7 +180,7 @@ def test_a_stale_full_checkpoint_destroys_nothing(tmp_path, capsys):
 @pytest.mark.parametrize("full", [0, 2])
 def test_a_run_that_was_interrupted_before_its_last_evaluation_is_finished_once(straight, tmp_path, capsys, full):
     path, config = tmp_path / "run", small_config(full_checkpoint_interval=full)
-    interrupted(config, path, 7)
+    interrupt_run(config, path, 7)
     assert metrics.read_rows(path / "metrics.jsonl")[-1]["iteration"] == 6
     list(make_fake_trainer(config, path, resume=True).run())
     assert rows_without_time(path) == rows_without_time(straight[0])
@@ -192,7 +192,7 @@ def test_a_run_that_was_interrupted_before_its_last_evaluation_is_finished_once(
 
 def test_a_run_that_is_asked_for_fewer_steps_than_it_has_is_evaluated(tmp_path, capsys):
     path, config = tmp_path / "run", small_config(eval_interval=4, full_checkpoint_interval=0)
-    interrupted(config, path, 5)
+    interrupt_run(config, path, 5)
     done = Checkpoints(path / "checkpoints").newest()
     assert done in (6, 7) and metrics.read_rows(path / "metrics.jsonl")[-1]["iteration"] == 4
     shorter = config.replace(env_steps=50)

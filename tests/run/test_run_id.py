@@ -41,7 +41,7 @@ def test_everything_that_a_run_writes_carries_its_id(tmp_path):
 
 
 def test_a_new_run_does_not_go_on_with_an_old_ones_checkpoints(straight, tmp_path, capsys):
-    """The old checkpoints could not be deleted, and the new run is interrupted before it has come as far as they are."""
+    """The old checkpoints could not be deleted, and the new run is interrupted before it reaches their iterations."""
     path = tmp_path / "run"
     run_until_sigterm(make_fake_trainer(small_config(), path), 2)
     for tier in (LIGHT, FULL):  # later than its own
@@ -134,8 +134,8 @@ def test_what_cannot_be_deleted_is_told_before_a_new_run_starts(straight, tmp_pa
     assert list(make_fake_trainer(small_config(env_steps=100), path, resume=True).run())[0].iteration == 9
 
 
-def moved_at(trainer, iteration: int, act) -> StorageError:
-    """Returns the error of a run that ends because its folder changes after ``iteration``."""
+def error_of_moved_run(trainer, iteration: int, act) -> StorageError:
+    """Return the error of a run that ends because ``act`` changes its folder after ``iteration``."""
     with pytest.raises(StorageError) as stopped:
         for report in trainer.run():
             if report.iteration == iteration:
@@ -148,7 +148,7 @@ def moved_at(trainer, iteration: int, act) -> StorageError:
 def test_a_folder_that_is_moved_is_told_where_it_is_and_goes_on_there(straight, tmp_path):
     old, new = tmp_path / "old", tmp_path / "new"
     config = small_config(full_checkpoint_interval=4, checkpoint_interval=4)
-    error = moved_at(make_fake_trainer(config, old), 5, lambda: old.rename(new))
+    error = error_of_moved_run(make_fake_trainer(config, old), 5, lambda: old.rename(new))
     assert f"{old} was moved to {new}" in str(error) and f"go on with --run-dir {new} --resume" in str(error)
     assert not old.exists()  # nothing that would look like a run
     list(make_fake_trainer(config, new, resume=True).run())
@@ -160,7 +160,7 @@ def test_a_folder_that_is_moved_is_told_where_it_is_and_goes_on_there(straight, 
 
 def test_a_folder_that_is_deleted_is_not_made_again(tmp_path):
     path = tmp_path / "run"
-    error = moved_at(make_fake_trainer(small_config(), path), 3, lambda: shutil.rmtree(path))
+    error = error_of_moved_run(make_fake_trainer(small_config(), path), 3, lambda: shutil.rmtree(path))
     assert f"{path} is gone" in str(error) and "make room" not in str(error)
     assert not path.exists()
 
@@ -168,7 +168,7 @@ def test_a_folder_that_is_deleted_is_not_made_again(tmp_path):
 @pytest.mark.parametrize("resume", [False, True])
 @pytest.mark.parametrize("is_moved", [False, True])
 def test_a_folder_that_goes_while_the_run_compiles_is_not_made_again(straight, tmp_path, monkeypatch, resume, is_moved):
-    """The lock went with it: another run could begin in a new one."""
+    """The lock was in the old folder: another run could begin in a new one."""
     path, there = tmp_path / "run", tmp_path / "there"
     if resume:
         shutil.copytree(straight[0], path)
@@ -212,7 +212,7 @@ def test_what_a_save_makes_again_of_a_deleted_folder_is_deleted_too(tmp_path, ot
             (path / other).parent.mkdir(exist_ok=True)
             (path / other).touch()
 
-    assert "is gone" in str(moved_at(make_fake_trainer(small_config(), path), 3, delete))
+    assert "is gone" in str(error_of_moved_run(make_fake_trainer(small_config(), path), 3, delete))
     assert path.exists() == (other is not None) and (other is None or (path / other).exists())
 
 
@@ -230,7 +230,7 @@ def test_a_new_folder_of_the_same_name_is_left_alone(tmp_path):
         path.mkdir()
         (path / "notes.txt").write_text("mine")
 
-    assert "was moved to" in str(moved_at(make_fake_trainer(small_config(), path), 3, replace)) or os.name != "posix"
+    assert "was moved to" in str(error_of_moved_run(make_fake_trainer(small_config(), path), 3, replace)) or os.name != "posix"
     assert [entry.name for entry in path.iterdir()] == ["notes.txt"]
 
 
@@ -322,9 +322,9 @@ def test_a_row_whose_id_has_a_wrong_bit_is_put_aside(straight, tmp_path, capsys)
     *lines, last = file.read_text().splitlines(keepends=True)
     run_id = read_run_id(path)
     assert run_id is not None and run_id in last
-    spoilt = last.replace(run_id, ("1" if run_id[0] == "0" else "0") + run_id[1:])
-    file.write_text("".join([*lines, spoilt]))
+    corrupted = last.replace(run_id, ("1" if run_id[0] == "0" else "0") + run_id[1:])
+    file.write_text("".join([*lines, corrupted]))
     list(make_fake_trainer(small_config(), path, resume=True).run())
     assert "metrics.jsonl held 1 row of another run: kept in" in capsys.readouterr().out
-    assert (path / "checkpoints" / "foreign" / "metrics.jsonl").read_text() == spoilt
+    assert (path / "checkpoints" / "foreign" / "metrics.jsonl").read_text() == corrupted
     assert rows_without_time(path)[-2:] == rows_without_time(straight[0])[-2:]

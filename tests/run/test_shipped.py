@@ -1,4 +1,4 @@
-"""Policies that come with the package: found by name, small, described by a card, and as good as what they were made of."""
+"""Policies in the package: found by name, small, described by a card, and as good as those of the runs they come from."""
 
 import json
 import re
@@ -35,7 +35,7 @@ MIN_SUCCESS = {
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A trained run of two seeds on images, and a folder of the package in which the second one is called told."""
+    """Trained run of two seeds on images, and a package folder in which the policy of the second one is called told."""
     folder = tmp_path_factory.mktemp("shipped")
     with pytest.MonkeyPatch.context() as monkeypatch:
         register(monkeypatch)
@@ -48,7 +48,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 @pytest.fixture
 def package(made: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The package of `made`, in use, and its tasks."""
+    """Package folder of `made`, in use, with its tasks registered."""
     register(monkeypatch)
     monkeypatch.setattr(shipped, "FOLDER", made[1])
     return made[1]

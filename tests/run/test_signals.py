@@ -1,4 +1,4 @@
-"""SIGTERM, Ctrl-C and other violence against a run."""
+"""SIGTERM, Ctrl-C and other interruptions of a run."""
 
 import contextlib
 import errno
@@ -86,7 +86,7 @@ def test_a_second_signal_does_not_wait(tmp_path):
 
 @pytest.fixture
 def compilations():
-    """Names of what XLA compiles from the moment on that ``watch`` is called with a trainer: at the end of its compilation."""
+    """Function that returns a list of a trainer's later compilations by XLA, which begins when its own compilation ends."""
     results: list[str] = []
     watching = []
 
@@ -342,7 +342,7 @@ def test_a_signal_ends_any_other_command_in_one_line(number, monkeypatch, capsys
 
 
 def test_a_command_that_does_not_look_up_is_ended(monkeypatch, not_ignored):
-    """XLA, say, may compile for minutes; a run, however, is given the time that it takes to save."""
+    """Code in XLA, for example, may compile for minutes; a run, however, is given the time that it takes to save."""
     monkeypatch.setattr(signals, "_PATIENCE_S", 0.1)
     given_up: queue.Queue[int] = queue.Queue()
     with signals.Ending(given_up.put):
@@ -358,7 +358,7 @@ def test_a_command_that_does_not_look_up_is_ended(monkeypatch, not_ignored):
 
 
 def test_a_second_signal_leaves_no_words_about_a_half_made_event_loop(monkeypatch):
-    """The handler may raise while orbax makes a loop, which Python then collects, and complains about."""
+    """If the handler raises while orbax creates a loop, Python reports an error when it collects the loop."""
     shown = []
     monkeypatch.setattr(sys, "unraisablehook", shown.append)
     with pytest.raises(Terminated), signals.Interruption():

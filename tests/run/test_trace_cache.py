@@ -1,4 +1,4 @@
-"""Programs that an earlier process has traced: found again, equal, and only where nothing has changed."""
+"""Programs that an earlier process has traced: found, equal, and used only if nothing has changed."""
 
 import dataclasses
 import hashlib
@@ -39,7 +39,7 @@ NAMES = ["init", "learn", "play"]
 
 
 class Told(probes.SeenGoWhereTold):
-    """A built-in task, by its module."""
+    """Probe whose module makes it a built-in task."""
 
     __module__ = "jaxrl_vis_envs.tasks.told"
 
@@ -59,7 +59,7 @@ def program():
 
 
 def untraceable(program, *names: str):
-    """The same program, except that functions cannot be traced."""
+    """Return the same program with some functions that cannot be traced."""
 
     def refuse(*arguments):
         raise AssertionError("traced")
@@ -68,7 +68,7 @@ def untraceable(program, *names: str):
 
 
 def results(made: Programs) -> list[np.ndarray]:
-    """All that two iterations and an evaluation return."""
+    """Return all arrays that two iterations and an evaluation return."""
     loop, first = made.train_iteration(made.init(made.run_keys))
     loop, second = made.train_iteration(loop)
     leaves = jax.tree.leaves((loop.replace(key=jax.random.key_data(loop.key)), first, second, made.evaluate(loop.train)))
@@ -113,7 +113,7 @@ def test_damaged_and_unsuitable_programs_are_traced_anew(folder, program):
     files["learn"].write_bytes(good["play"])  # whole, but renamed
     Programs(CONFIG, program, keep=True).compile()
     assert {path.name.partition("-")[0]: path.read_bytes() for path in folder.iterdir()} == good
-    data = good["play"][32:]  # of something else, by whoever knows what a digest is of
+    data = good["play"][32:]  # of something else, with a digest that fits
     files["learn"].write_bytes(hashlib.sha256(files["learn"].name.encode() + b"\0" + data).digest() + data)
     unsuitable = Programs(CONFIG, program, keep=True)
     unsuitable.compile()
@@ -231,7 +231,7 @@ def test_commands_cache_programs_and_scripts_do_not(tmp_path, monkeypatch, capsy
 
 @pytest.fixture
 def kept(folder) -> trace_cache.TraceCache:
-    """A program that was kept, without any of JAX."""
+    """Cache that holds a program, which is a few bytes and not one of JAX."""
     made = trace_cache.TraceCache(folder, "0" * 64)
     made._fresh["play"] = b"a program"
     made.write()

@@ -68,7 +68,7 @@ def test_a_replay_that_cannot_fit_is_refused_before_allocation(tmp_path, monkeyp
 
 
 def test_an_evaluation_begins_early_only_where_there_is_room(straight, tmp_path, monkeypatch):
-    """An early evaluation begins before the host has read the last iteration's results; its own equal those of a later one."""
+    """An early evaluation begins before the host has read the last iteration's results, and gives the same as a later one."""
     run_dir, made, _ = straight
     compiled = made.programs.compile()
     state, scratch = memory._sizes(compiled)
@@ -85,7 +85,7 @@ def test_an_evaluation_begins_early_only_where_there_is_room(straight, tmp_path,
 
 
 def test_the_compilers_own_figures_count_on_a_cpu_too(straight, tmp_path, monkeypatch):
-    """Scratch memory of the evaluation, which depends on --eval-episodes, is asked for before anything is allocated."""
+    """The evaluation's scratch memory, which depends on --eval-episodes, is checked before anything is allocated."""
     compiled = straight[1].programs.compile()
     memory.check_compiled(compiled, is_allocated=False)
     state = compiled["learn"].memory_analysis().argument_size_in_bytes
@@ -157,7 +157,7 @@ def test_where_a_simulation_went_wrong(name, place, said):
 
 
 def test_bad_episodes_of_a_replay_that_devices_share_are_dumped(tmp_path):
-    """Its episodes are numbered by rollout and environment."""
+    """Episodes of a shared replay are numbered by rollout and environment."""
     made = make_fake_trainer(small_config(), None)
     loop = made.init(made.run_keys)
     states, actions = loop.replay.episodes.states, loop.replay.episodes.actions

@@ -1,4 +1,4 @@
-"""A run folder that brings code of its own: asked before it runs, and remembered."""
+"""Run folders that bring code of their own: users are asked before it runs, and their answer is remembered."""
 
 import io
 import json
@@ -32,7 +32,7 @@ COMMANDS = {
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch) -> Path:
-    """The user's cache, empty."""
+    """Folder of trusted runs in the user's cache, which is empty."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(trust, "_trusted_here", set())
     return tmp_path / "cache" / "jaxrl-vis" / "trusted"
@@ -40,7 +40,7 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 @pytest.fixture
 def stranger(here, cache) -> Path:
-    """A run of somebody else, with the code beside it, in the current folder."""
+    """Run of another user in the current folder, with code in its folder."""
     run = here / "run"
     config = CONFIG.replace(env_folder="run", aux_tasks=("autoencoder",), weighting="fixed")
     RunFolder(run).open(config)
@@ -113,7 +113,7 @@ def test_what_was_trusted_is_remembered_for_that_run_and_that_code(stranger, cac
 
 
 def test_whoever_has_trained_a_run_is_not_asked(here, cache, monkeypatch):
-    """The code may change: who trains with it, works on it."""
+    """The code may change, because those who train with it also edit it."""
     (here / "mine.py").write_text("")
     config = CONFIG.replace(env="mine:Reach", env_folder=str(here))
     run = here / "runs" / "mine"
@@ -128,7 +128,7 @@ def test_whoever_has_trained_a_run_is_not_asked(here, cache, monkeypatch):
     assert not trust.is_trusted(run, config.replace(env_folder=str(run)))
 
 
-def test_a_cache_that_cannot_be_written_is_no_hindrance(stranger, cache):
+def test_a_cache_that_cannot_be_written_is_not_an_obstacle(stranger, cache):
     cache.parent.parent.mkdir()
     cache.parent.write_text("a file")
     config = read_config(stranger)

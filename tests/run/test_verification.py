@@ -1,4 +1,4 @@
-"""`jaxrl-vis verify`: a run is repeated, and whatever was changed in its folder is found."""
+"""`jaxrl-vis verify`: a run is repeated, and any change in its folder is found."""
 
 import dataclasses
 import hashlib
@@ -27,13 +27,13 @@ from jaxrl_vis.run.verifying.verification import Verification, verify
 
 
 def expected_in(path: Path) -> RowConditions:
-    """Conditions on the rows of the run of eight iterations."""
+    """Return the conditions for the rows of the run of eight iterations."""
     return RowConditions(seeds=[0, 1], updates=3, env_steps=10, eval_interval=2, run_id=read_run_id(path))
 
 
 @pytest.fixture(scope="module")
 def run_trainer(straight) -> Callable[..., Trainer]:
-    """Makes trainers of the fake program, which is compiled once for all tests."""
+    """Function that makes trainers of the fake program, which is compiled once for all tests."""
 
     def function(config: Config, path: Path | None = None, resume: bool = False) -> Trainer:
         trainer = Trainer(config, FakeProgram(config), path, resume=resume)
@@ -45,7 +45,7 @@ def run_trainer(straight) -> Callable[..., Trainer]:
 
 @pytest.fixture(scope="module")
 def verified(run_trainer) -> Callable[..., Verification]:
-    """Verifies a folder."""
+    """Function that verifies a folder and returns the report."""
 
     def function(path: Path, iterations: int | None = None, echo: Callable[[str], None] = lambda line: None) -> Verification:
         record, config, report = read_record(path), read_config(path), Verification()
@@ -57,7 +57,7 @@ def verified(run_trainer) -> Callable[..., Verification]:
 
 @pytest.fixture
 def copy(straight, tmp_path) -> Path:
-    """A run of two seeds and eight iterations, evaluated and saved in both ways after each second one."""
+    """Run of two seeds and eight iterations, with an evaluation and both kinds of checkpoint after every second one."""
     return Path(shutil.copytree(straight[0], tmp_path / "run"))
 
 

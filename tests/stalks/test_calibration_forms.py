@@ -57,7 +57,7 @@ def ros2(shift: float, binning: int = 0, roi: tuple[int, int, int, int] = (0, 0,
     )
 
 
-def table(shift: float) -> str:
+def ros1_csv(shift: float) -> str:
     cells = {"%time": 1608946479473160331, "field.header.seq": 1, "field.height": 480, "field.width": 640}
     cells |= {f"field.P{place}": value for place, value in enumerate(p(shift))}
     cells |= {"field.binning_x": 0, "field.binning_y": 0, "field.roi.height": 0, "field.roi.width": 0}
@@ -133,7 +133,7 @@ FORMS: dict[str, dict[str, str]] = {
     "rostopic echo after a warning": both(
         lambda shift: "WARNING: no messages received and simulated time is active.\n" + ros1(shift)
     ),
-    "rostopic echo -p": both(table, ".txt"),
+    "rostopic echo -p": both(ros1_csv, ".txt"),
     "ros2 topic echo": both(lambda shift: ros2(shift) + "---\n"),
     "ros2 topic echo --csv": both(ros2_csv, ".txt"),
     "print of rclpy": both(printed, ".txt"),

@@ -87,7 +87,7 @@ def test_brapi_has_what_its_calls_ask_for(tmp_path):
     assert {entry["observationUnitDbId"] for entry in data["observations"]} <= units
     assert {entry["observationVariableDbId"] for entry in data["observations"]} <= set(variables)
     counts = [entry["value"] for entry in data["observations"] if entry["observationVariableDbId"] == "stalks"]
-    assert counts == ["33"]  # what was not counted is no observation
+    assert counts == ["33"]  # what was not counted is not an observation
 
 
 def test_miappe_has_what_its_checklist_asks_for(tmp_path):

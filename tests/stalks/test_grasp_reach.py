@@ -136,7 +136,7 @@ def test_room_is_the_least_distance_of_the_open_gripper_from_others():
     assert beside(np.nan) == np.inf
     assert beside(0.06) > beside(0.045) > beside(0.03)
     assert beside(0.0) < 0 and beside(0.06) < 0.06 - 0.006 - stalk_arm.OPENING / 2
-    # One in the way is no matter beside the jaws at the target, but on the way there.
+    # One in the way does not matter beside the jaws at the target, but does on the way there.
     assert beside(0.0, -0.08) > 0.005 > 0 > beside(0.0, -0.08, whole_way=True)
 
 

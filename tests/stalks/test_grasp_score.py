@@ -106,7 +106,7 @@ def test_the_failing_stage_is_the_first():
     np.testing.assert_allclose(found.aim_errors, [0.03, 0.03, 0.002, 0.03, 0.03])
 
 
-def test_what_is_refused_fails_in_every_total_and_is_no_reach():
+def test_what_is_refused_fails_in_every_total_and_is_not_a_reach():
     attempts = [
         Attempt(0, 0, held(0)),
         Attempt(0, 1, held(), refused=True),

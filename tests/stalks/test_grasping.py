@@ -245,7 +245,7 @@ def test_a_stalk_that_pairs_show_beside_itself_is_one():
     assert len(points) == 1
 
 
-def test_what_other_pairs_see_through_is_no_stalk():
+def test_what_other_pairs_see_through_is_not_a_stalk():
     ghost = (0.02, 0.5, 0.0)
     clouds = [seen([*STALKS, ghost], 0.1), seen(STALKS, 0.05), seen(STALKS, 0.0)]
     motions = [Motion.along(-0.1), Motion.along(-0.05), Motion.along(0.0)]

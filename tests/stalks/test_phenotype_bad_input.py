@@ -181,7 +181,7 @@ def test_synth_adds_the_truth_that_is_missing(plots, tmp_path, capsys):
     assert [path.name for path in sorted((tmp_path / "plot_0000").glob("left_*"))] == ["left_000.png"]
     annotations = json.loads((tmp_path / "plot_0000" / "annotations.json").read_text())["annotations"]
     assert annotations and all("segmentation" in each for each in annotations)
-    # What holds more than is asked for stays.
+    # What holds more than is required stays.
     assert cli.main([*words, "boxes"]) == 0
     assert "1 there already" in capsys.readouterr().out
 
@@ -267,7 +267,7 @@ def test_widths_without_ground_say_so(plots, tmp_path, capsys):
     assert "mm thick, no visible ground" in page and "thick at 12 inches" not in page
 
 
-def test_nothing_seen_is_no_count(plots, tmp_path, capsys):
+def test_nothing_seen_gives_no_count(plots, tmp_path, capsys):
     """The plot may be empty, or its camera may be unfamiliar to the networks."""
     plot = tmp_path / "plot_0000"
     shutil.copytree(plots / "plot_0000", plot)

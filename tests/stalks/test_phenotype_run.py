@@ -82,7 +82,7 @@ def test_eval_in_two_processes_and_after_a_stop_is_the_same(plots, tmp_path, cap
     def evaluate(name: str, *words: str) -> dict:
         assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / name), *words]) == 0
         data = json.loads((tmp_path / name).read_text())
-        for each in (data, *data["each"]):  # times are no figures
+        for each in (data, *data["each"]):  # times are not metrics
             each.pop("seconds_per_pair")
             each.pop("workers", None)
         return data
@@ -182,7 +182,7 @@ def test_wrong_requests_of_figures(tmp_path, monkeypatch, capsys, words, part):
     assert part in capsys.readouterr().err
 
 
-def test_what_is_no_evaluation(tmp_path, capsys):
+def test_what_is_not_an_evaluation(tmp_path, capsys):
     path = tmp_path / "eval.json"
     for text in ("", "{}", '{"synthetic": true, "each": [{}]}'):
         path.write_text(text)

@@ -107,7 +107,7 @@ def test_outlines_teach_masks(folder, weights, tmp_path):
 
 
 def test_boxes_of_another_size_start_from_random_weights_or_are_refused(folder, tmp_path, capsys):
-    # A calibration says how large the stalks are: 30 lines, where the weights that ship know 135.
+    # A calibration says how large the stalks are: 30 lines, where the shipped weights have 135.
     calibrated = tmp_path / "calibrated"
     shutil.copytree(folder, calibrated)
     pixels_per_metre = read_weights(SHIPPED)[1].pixels_per_metre
@@ -296,5 +296,5 @@ def test_outlines_beyond_the_image_and_of_several_parts():
     np.testing.assert_array_equal(rasterize_polygons([[-7, -3, 5, -3, 5, 4, -7, 4]], (10, 12)), inside)
     inside[6:, 9:] = True
     parts = [[-7, -3, 5, -3, 5, 4, -7, 4], [0, 0, 3, 0, 3, 3, 0, 3], [9, 6, 30, 6, 30, 30, 9, 30]]
-    np.testing.assert_array_equal(rasterize_polygons(parts, (10, 12)), inside)  # parts that overlap are no holes
+    np.testing.assert_array_equal(rasterize_polygons(parts, (10, 12)), inside)  # parts that overlap are not holes
     assert not rasterize_polygons([[20, 20, 30, 20, 30, 30]], (10, 12)).any()

@@ -150,7 +150,7 @@ def test_taper_is_followed():
 
 
 @pytest.mark.parametrize("mask", [np.zeros((60, 40), bool), np.ones((60, 40), bool), np.eye(5, dtype=bool)])
-def test_what_is_no_strip_has_no_width(mask):
+def test_what_is_not_a_strip_has_no_width(mask):
     assert fit_strip(mask) is None
 
 
@@ -323,7 +323,7 @@ def test_images_of_other_numbers_are_told(tmp_path, kind, shape):
     assert error.value.strerror == f"it holds {kind} pixels: save it with 8 or 16 bits"
 
 
-def test_what_opencv_stumbles_over_is_no_image(tmp_path, monkeypatch):
+def test_what_opencv_cannot_read_is_not_an_image(tmp_path, monkeypatch):
     write_image(tmp_path / "a.png", np.zeros((2, 3), np.uint8))
 
     def fail(*_):

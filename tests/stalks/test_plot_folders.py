@@ -274,7 +274,7 @@ def test_times_in_nanoseconds_keep_their_differences(tmp_path):
 
 
 @pytest.mark.parametrize("number", ["1_0", "nan", "inf", "1e400", "", "x"])
-def test_cells_that_are_no_numbers_are_told_with_their_line(tmp_path, number):
+def test_cells_that_are_not_numbers_are_reported_with_their_line(tmp_path, number):
     (tmp_path / "odometry.csv").write_text(f"left,distance_m\nleft0000.jpg,0\n\nleft0001.jpg,{number}\n")
     if number == "1_0":
         assert read_odometry(plot(tmp_path)) == {"left0000": 0.0, "left0001": 10.0}

@@ -180,15 +180,15 @@ def test_encodings_that_cannot_be_read_are_told(tmp_path):
         extract_recording(write(tmp_path / "row.bag", 1, "yuv422"), tmp_path)
 
 
-@pytest.mark.parametrize("kind", ["cut", "spoilt", "empty", "text"])
+@pytest.mark.parametrize("kind", ["cut", "corrupted", "empty", "text"])
 @pytest.mark.parametrize("name", ["row.bag", "row.mcap", "row.db3"])
-def test_files_that_are_no_recordings_are_told_in_one_line(tmp_path, name, kind):
+def test_files_that_are_not_recordings_are_reported_in_one_line(tmp_path, name, kind):
     whole = b"hello " * 50
-    if name == "row.bag" and kind in ("cut", "spoilt"):
+    if name == "row.bag" and kind in ("cut", "corrupted"):
         whole = write(tmp_path / "good.bag", 1).read_bytes()
     data = {
         "cut": whole[: len(whole) // 2],
-        "spoilt": whole[:4150] + b"\xff" * 400 + whole[4550:],
+        "corrupted": whole[:4150] + b"\xff" * 400 + whole[4550:],
         "empty": b"",
         "text": b"hello",
     }

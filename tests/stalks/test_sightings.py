@@ -181,7 +181,7 @@ def test_stalks_that_are_missed_in_some_pairs_stay_one():
     assert sum(track.counted for track in tracks) == len(STALKS)
 
 
-def test_what_few_pairs_show_is_no_stalk_and_ends_are_ends():
+def test_what_few_pairs_show_is_not_a_stalk_and_ends_are_ends():
     frames, distances = drive([*STALKS, (2.3, 0.8)])
     frames[8].append(sighting(0.05))  # a leaf, once
     tracks, _ = track_stalks(frames, distances, CAMERAS)
@@ -219,7 +219,7 @@ def test_a_stalk_that_leans_out_of_the_plot_stands_in_it():
         assert any(track.position_m > 1.97 for track in counted) == bool(more)
 
 
-def test_a_stalk_whose_depth_went_astray_is_no_other_one():
+def test_a_stalk_with_a_wrong_depth_is_not_another_one():
     """In some pairs, its depth is 6 cm too large, but it is seen in the same direction."""
     frames, distances = drive([(0.6, 0.8), (1.4, 0.8)])
     for frame in frames[3:7]:

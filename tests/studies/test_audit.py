@@ -1,4 +1,4 @@
-"""Audit of rewards: its measures on cases that are known, and whole audits of rewards that are right, wrong and no rewards."""
+"""Audit of rewards: its measures in known cases, and whole audits of correct, wrong and unusable rewards."""
 
 import json
 from collections.abc import Iterator

@@ -1,11 +1,11 @@
-"""Figures ``goals`` and ``weightings``: their runs are what they are called, and a table is that of made-up runs."""
+"""Figures ``goals`` and ``weightings``: runs have the settings that they are named after, and a table is that of invented runs."""
 
 import csv
 import json
 from pathlib import Path
 
 import pytest
-from test_studies_figures import has_colour, made_up, slope
+from test_studies_figures import has_colour, slope, write_run
 
 from jaxrl_vis import cli
 from jaxrl_vis.config import preset
@@ -46,7 +46,7 @@ def test_the_table_has_intervals_steps_and_seconds(tmp_path: Path) -> None:
     runs, out = tmp_path / "runs", tmp_path / "goals.png"
     cells = make_cells(STUDY, ("VisualFetchReach",), STUDY.variants, Scope("fast"))
     for (_, variant), (cell,) in cells.items():
-        made_up(cell, runs, slope({"oracle": 20.0, "contrastive": 2.0}.get(variant, 6.0)), every=5000)
+        write_run(cell, runs, slope({"oracle": 20.0, "contrastive": 2.0}.get(variant, 6.0)), every=5000)
         file = runs / cell.name / "metrics.jsonl"
         rows = [json.loads(row) for row in file.read_text().splitlines()]
         rows = [row | {"time/wall_s": 30.0 + row["env_steps"] / 1000, "time/compile_s": 20.0} for row in rows]

@@ -1,4 +1,4 @@
-"""The quadratic example: the package's weightings beside plain transcriptions in NumPy."""
+"""The quadratic example: the package's weightings, compared with plain transcriptions in NumPy."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ HALF = np.array([0.5, 0.5])
 
 
 def transcription(start: tuple[float, float], steps: int, step_size: float) -> tuple[np.ndarray, np.ndarray]:
-    """The authors' rule: points [steps + 1, 2] and weights [steps + 1, 2] in float64."""
+    """Return points [steps + 1, 2] and weights [steps + 1, 2] by the authors' rule, in float64."""
     point, weights = np.array(start), np.ones(2)
     points, history = [point], [weights]
     for _ in range(steps):
@@ -52,13 +52,13 @@ def test_adaptive_weights_find_the_main_minimum_and_fixed_ones_do_not(adaptive: 
 
 
 def positive_losses(point: Any) -> dict[str, Any]:
-    """Losses that are positive everywhere: a bowl, a shifted one, and one that falls where the first rises."""
+    """Return losses that are positive everywhere: a bowl, a shifted one, and one that falls where the first rises."""
     main = (point**2).sum()
     return {MAIN: main, "shifted": ((point - 0.5) ** 2).sum(), "opposed": 1.0 / (1.0 + main)}
 
 
 def algorithm_1(start: np.ndarray, steps: int, interval: int, alpha: float, beta: float, eps: float) -> np.ndarray:
-    """Algorithm 1 of the thesis with a plus and a bound at 0, in float64: rows of x, y and the two weights, [steps + 1, 4]."""
+    """Return x, y and both weights, [steps + 1, 4], by the thesis's algorithm 1 with a plus and a bound at 0, in float64."""
     point, weights, total = start.astype(np.float64), np.ones(2), np.zeros(2)
     rows = [[*point, *weights]]
     for t in range(steps):
@@ -78,7 +78,7 @@ def algorithm_1(start: np.ndarray, steps: int, interval: int, alpha: float, beta
 
 @pytest.mark.parametrize("interval", [1, 5])
 def test_algorithm_1_is_its_transcription(interval: int) -> None:
-    """Both take 1,002 steps, which 5 does not divide, in float64: rounding of float32 would grow along the way."""
+    """Both take 1,002 steps, not a multiple of 5, in float64, because rounding of float32 would grow along the way."""
     start, alpha, beta, eps, steps = np.array([1.8, 1.0]), 0.002, 5.0 * interval, 0.05, 1002
     with jax.enable_x64(True):
         weighting = make_weighting("ol_aux", interval=interval, learning_rate=alpha, beta=beta, eps=eps, main_eps=eps)

@@ -1,4 +1,4 @@
-"""`jaxrl-vis search`: Optuna proposes, scripts train, and what was interrupted goes on."""
+"""`jaxrl-vis search`: Optuna proposes, scripts train, and interrupted searches continue."""
 
 import sys
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ NOISE = read_range("action-noise=0.1,0.2")
 
 
 class Script:
-    """A command for trials, with what some of them do; and how often it was asked."""
+    """Commands of trials, with special behaviour of some families; it records its calls."""
 
     def __init__(self, **behaviour: str):
         self.behaviour, self.calls = behaviour, []

@@ -1,4 +1,4 @@
-"""Statistics over seeds against values that can be counted by hand, and against their own promises."""
+"""Statistics over seeds: comparison with values counted by hand, and with the coverage that they claim."""
 
 import numpy as np
 import pytest

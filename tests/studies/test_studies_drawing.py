@@ -1,4 +1,4 @@
-"""Figures of several runs, as they are drawn."""
+"""Drawing of figures that compare several runs."""
 
 import itertools
 
@@ -12,7 +12,7 @@ from jaxrl_vis.studies.figures.make import STUDIES
 
 @pytest.mark.parametrize("figure", list(STUDIES))
 def test_no_text_of_a_figure_is_cut(figure: str) -> None:
-    """The title of `cameras` once ran out of a figure of one column."""
+    """Regression test: the title of `cameras` was wider than a figure of one column."""
     study = STUDIES[figure]
     steps, values = np.array([10_000, 100_000]), np.ones((1, 2))
     curves = [Curve(study.family.variants[name].label, "#000000", steps, values) for name in study.variants]

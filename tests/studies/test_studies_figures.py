@@ -1,4 +1,4 @@
-"""Figures 5.4 to 5.7 and their tables, from runs that were made up, and once from runs that were trained."""
+"""Figures 5.4 to 5.7 and their tables, from invented runs, and once from trained ones."""
 
 import csv
 import dataclasses
@@ -29,8 +29,8 @@ from jaxrl_vis_envs import registry
 EVERY = 20_000
 
 
-def made_up(cell: Cell, runs: Path, success: Callable[[int], float], every: int = EVERY, **extra) -> None:
-    """A finished run whose seeds differ by a hundredth."""
+def write_run(cell: Cell, runs: Path, success: Callable[[int], float], every: int = EVERY, **extra) -> None:
+    """Write a finished run whose seeds differ by a hundredth."""
     folder = runs / cell.name
     folder.mkdir(parents=True)
     record = {
@@ -100,7 +100,7 @@ def test_every_variant_can_be_made_with_every_preset(preset: str) -> None:
 
 
 def test_families_keep_configurations_apart() -> None:
-    """Two cells of one name are one cell."""
+    """Cells of the same name have the same configuration."""
     cells_by_name: dict[str, Cell] = {}
     for preset in ("paper", "fast"):
         for options in ((), ("view=fingertips",), ("view=fingertips", "tip_marks=faint")):
@@ -114,7 +114,7 @@ def test_families_keep_configurations_apart() -> None:
 def test_settings_of_an_environment_are_shown_and_name_one_folder(tmp_path: Path) -> None:
     scope = Scope(seeds=2, env_steps=100_000, changes={"env_options": ("depth_encoding=zbuffer", "clip_range=0.1/9")})
     ((cell,),) = make_cells(STUDIES["5.4"], (FETCH,), ("none",), scope).values()
-    made_up(cell, tmp_path, slope(1.0))
+    write_run(cell, tmp_path, slope(1.0))
     assert [folder.name for folder in tmp_path.iterdir()] == [cell.name]
     request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), scope, draw_only=True)
     assert make_figure(request, lambda line: None)
@@ -138,7 +138,7 @@ def test_differences_of_curves_are_taken_where_both_are_known() -> None:
 
 
 def line(values: list[list[float]], task: str = FETCH, variant: str = "ol_aux_5") -> Line:
-    """Evaluations every 20 k steps; values are [S][P]."""
+    """Return a line with evaluations every 20 k steps; ``values`` are [S][P]."""
     rows = [
         {"seed": seed, "env_steps": EVERY * place, "updates": 200 * place, "eval/success": value}
         for seed, row in enumerate(values)
@@ -206,7 +206,7 @@ def test_a_figure_shows_what_is_finished_and_lists_the_rest(tmp_path: Path, caps
     cells = all_cells("5.4")
     for (task, variant), (cell,) in cells.items():
         if (task, variant) != (HAND, "cosine") and task != FINGER:
-            made_up(cell, runs, slope({"none": 1.0, "ol_aux_5": 2.0}.get(variant, 1.5)))
+            write_run(cell, runs, slope({"none": 1.0, "ol_aux_5": 2.0}.get(variant, 1.5)))
     words = ["figure", "5.4", "--draw-only", "--runs", str(runs), "--out", str(out)]
     assert cli.main(words) == 3
     printed = capsys.readouterr().out.splitlines()
@@ -233,7 +233,7 @@ def test_a_figure_shows_what_is_finished_and_lists_the_rest(tmp_path: Path, caps
     assert "not known before all runs" in (tmp_path / "w.md").read_text()
     for place, name in enumerate(AUX_TASKS):
         (cell,) = all_cells("5.5")[FETCH, name]
-        made_up(cell, runs, slope(1.1 + place / 10))
+        write_run(cell, runs, slope(1.1 + place / 10))
     assert make_figure(Request("5.6", STUDIES["5.6"], tmp_path / "w.pdf", runs, tasks=(FETCH,), draw_only=True))
     assert (tmp_path / "w.pdf").read_bytes().startswith(b"%PDF")
     assert "not defined" in (tmp_path / "w.md").read_text()  # all weights were alike
@@ -246,7 +246,7 @@ def test_a_figure_shows_what_is_finished_and_lists_the_rest(tmp_path: Path, caps
 
 def test_the_title_of_weights_names_their_method(tmp_path: Path) -> None:
     (cell,) = all_cells("5.6", (FETCH,), ("ol_aux_1",))[FETCH, "ol_aux_1"]
-    made_up(cell, tmp_path, slope(1.0))
+    write_run(cell, tmp_path, slope(1.0))
     request = Request("5.6", STUDIES["5.6"], tmp_path / "w.png", tmp_path, (FETCH,), ("ol_aux_1",), draw_only=True)
     assert make_figure(request)
     title = request.out.with_suffix(".md").read_text().splitlines()[0]
@@ -263,7 +263,7 @@ def test_rewards_with_and_without_ground_truth_are_compared(tmp_path: Path, caps
     for (task, variant), (cell,) in cells.items():
         if (task, variant) == ("VisualReacher", "autoencoder"):
             continue
-        made_up(cell, runs, slope({"oracle": 4.0, "indicator": 1.0}.get(variant, 2.0)))
+        write_run(cell, runs, slope({"oracle": 4.0, "indicator": 1.0}.get(variant, 2.0)))
         file = runs / cell.name / "metrics.jsonl"
         rows = [json.loads(row) for row in file.read_text().splitlines()]
         drops = 0.2 if variant == "indicator_balance_filter" else 0.0
@@ -289,11 +289,11 @@ def test_rewards_with_and_without_ground_truth_are_compared(tmp_path: Path, caps
 
 
 def test_panels_say_no_more_about_an_inactive_filter_than_tables(tmp_path: Path) -> None:
-    """A single negative that was dropped and false once was a dot at 100 %, beside a table that gave no precision."""
+    """Regression test: one dropped negative, which was false, was a dot at 100 %, although the table gave no precision."""
     study = indicator.STUDIES["5.2"]
     variant = "indicator_balance_filter"
     ((cell,),) = make_cells(study, ("VisualSawyerReach",), (variant,), Scope("fast")).values()
-    made_up(cell, tmp_path, slope(1.0))
+    write_run(cell, tmp_path, slope(1.0))
     for share, titles in ((0.009, 3), (0.011, 4)):
         file = tmp_path / cell.name / "metrics.jsonl"
         rewards = {"train/positive_share": 0.5, "train/false_negative_share": 0.1, "eval/goal_distance": 0.2}
@@ -313,7 +313,7 @@ def test_distances_of_figures_are_in_metres() -> None:
 
 def test_what_is_asked_for_twice_is_shown_once(tmp_path: Path) -> None:
     (cell,) = all_cells("5.4", (FETCH,), ("none",))[FETCH, "none"]
-    made_up(cell, tmp_path, slope(1.0))
+    write_run(cell, tmp_path, slope(1.0))
     words = ["figure", "5.4", "--draw-only", "--runs", str(tmp_path), "--out", str(tmp_path / "f.png")]
     assert cli.main([*words, "--tasks", FETCH, FETCH, "--methods", "none", "none"]) == 0
     assert (tmp_path / "f.md").read_text().count(f"### {FETCH}") == 1
@@ -322,7 +322,7 @@ def test_what_is_asked_for_twice_is_shown_once(tmp_path: Path) -> None:
 def test_a_comparison_with_an_oracle_that_fails_does_not_count(tmp_path: Path) -> None:
     study = indicator.STUDIES["5.2"]
     ((cell,),) = make_cells(study, ("VisualSawyerReach",), ("oracle",), Scope("fast")).values()
-    made_up(cell, tmp_path, slope(1.0))
+    write_run(cell, tmp_path, slope(1.0))
     file = tmp_path / cell.name / "metrics.jsonl"
     rows = [json.loads(row) | {"eval/goal_distance": 0.2} for row in file.read_text().splitlines()]
     file.write_text("".join(json.dumps(row) + "\n" for row in rows))
@@ -338,7 +338,7 @@ def test_runs_of_other_settings_are_drawn_only_where_nothing_is_trained_and_name
     (cell,) = all_cells("5.4")[FETCH, "none"]
     # Which logarithm the actor learns makes no difference where nothing is weighted.
     older = dataclasses.replace(cell, config=cell.config.replace(random_shift=3, actor_log="loss"))
-    made_up(older, tmp_path, slope(1.0))
+    write_run(older, tmp_path, slope(1.0))
     assert contradiction(cell, tmp_path) and not is_finished(cell, tmp_path)
     request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), draw_only=True)
     assert make_figure(request)
@@ -357,7 +357,7 @@ def test_every_figure_of_rewards_can_be_made_with_every_preset(preset: str) -> N
 
 def test_a_run_that_lost_its_replay_is_owned_up_to(tmp_path: Path) -> None:
     (cell,) = all_cells("5.4")[FETCH, "none"]
-    made_up(cell, tmp_path, slope(1.0))
+    write_run(cell, tmp_path, slope(1.0))
     file = tmp_path / cell.name / "metrics.jsonl"
     rows = [json.loads(row) for row in file.read_text().splitlines()]
     file.write_text("".join(json.dumps(row | {"resume/replay_lost_at": 20}) + "\n" for row in rows))
@@ -371,9 +371,9 @@ def test_seeds_of_several_runs_are_one_line(tmp_path: Path) -> None:
     assert len(parts) == 3
     request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), scope, draw_only=True)
     for cell in parts[:2]:
-        made_up(cell, tmp_path, slope(1.0))
+        write_run(cell, tmp_path, slope(1.0))
     assert not make_figure(request) and not request.out.exists()
-    made_up(parts[2], tmp_path, slope(1.0))
+    write_run(parts[2], tmp_path, slope(1.0))
     assert make_figure(request) and "seeds 0 to 4" in request.out.with_suffix(".md").read_text()
 
 
@@ -407,7 +407,7 @@ def test_bad_requests_get_one_line(words: list[str], parts: list[str], here: Pat
 def test_runs_that_end_before_the_authors_first_evaluation_are_drawn(tmp_path: Path) -> None:
     scope = Scope("cpu", seeds=1, env_steps=6_400)
     ((cell,),) = make_cells(STUDIES["5.4"], (FETCH,), ("none",), scope).values()
-    made_up(cell, tmp_path, slope(1.0), every=3_200)
+    write_run(cell, tmp_path, slope(1.0), every=3_200)
     request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), scope)
     said: list[str] = []
     assert make_figure(request, said.append)  # nothing is left to train

@@ -1,4 +1,4 @@
-"""The grid engine, with small scripts in the place of training runs."""
+"""The grid engine, with small scripts in place of training runs."""
 
 import dataclasses
 import json
@@ -31,7 +31,7 @@ from jaxrl_vis.studies.engine.grid import run_cells, train_command
 
 CPU = [Device("the CPU", {})]
 
-# A run that evaluates every 100 steps, and writes down how it was started; what else it does is told by one word.
+# A run that evaluates every 100 steps, and records how it was started; one word selects what else it does.
 SCRIPT = """
 import json, os, pathlib, signal, sys, time
 folder, config, behaviour = pathlib.Path(sys.argv[1]), sys.argv[4], sys.argv[5]
@@ -68,7 +68,7 @@ def saved(cell: Cell) -> str:
 
 
 class Script:
-    """A command for cells: what each does, by family; and how often it was asked."""
+    """Commands of cells, with special behaviour of some families; it records its calls."""
 
     def __init__(self, **behaviour: str):
         self.behaviour, self.calls = behaviour, []
@@ -113,7 +113,7 @@ def test_a_cell_that_fails_is_told_in_one_line_and_the_others_go_on(tmp_path: Pa
 
 
 def test_a_cell_that_trained_with_other_settings_says_which(tmp_path: Path) -> None:
-    """The log ends as that of any good run; another version may have been installed while a figure was trained."""
+    """The log ends like that of any good run; another version may have been installed while a figure was trained."""
     cell = make_cell("a")
     script = Script()
 

@@ -1,4 +1,4 @@
-"""Weightings of auxiliary losses: their rules, and what states of theirs go through."""
+"""Weightings of auxiliary losses: their rules, and their states in vmap, checkpoints and batches on several devices."""
 
 import functools
 import os
@@ -37,13 +37,13 @@ from jaxrl_vis.weighting.base import log_loss, log_slope
 
 @functools.cache
 def raw_gradients(seed: int) -> tuple[Any, dict[str, Any]]:
-    """Losses and their gradients with respect to the encoder."""
+    """Return the losses and their gradients with respect to the encoder."""
     losses, gradients, _ = jax.jit(functools.partial(loss_gradients, losses_of))(*in_float32(problem(seed)))
     return losses, {name: encoder_of(tree) for name, tree in gradients.items()}
 
 
 def feed(weighting: Weighting, dots: list[dict[str, float]], losses: dict[str, float] | None = None) -> list[dict[str, float]]:
-    """Weights after each update with these dots, of losses that are 1 if not given."""
+    """Return the weights after each update with these dots, for losses that are 1 if not given."""
     losses = losses or dict.fromkeys(NAMES, 1.0)
     update = jax.jit(weighting.update)
     state = weighting.init(NAMES)
@@ -91,7 +91,7 @@ def test_beta_is_five_n_unless_given() -> None:
 
 
 def test_a_reversed_gradient_drives_its_weight_to_zero_and_back() -> None:
-    """Task `near` helps; as soon as its gradient is turned around, its weight falls to 0, stays there, and can recover."""
+    """Task `near` helps; once its gradient is reversed, its weight falls to 0, stays there, and can recover."""
     weighting = make_weighting("ol_aux", interval=2, learning_rate=0.1)
     losses, gradients = raw_gradients(0)
     compared = gradients | {"near": gradients[MAIN]}
@@ -223,7 +223,7 @@ def test_finite_at_zero_and_negative_losses(case: str) -> None:
 
 @pytest.mark.parametrize("case", ["cosine", "ol_aux", "ol_aux window", "ol_aux_ablation"])
 def test_seeds_side_by_side_are_seeds_one_by_one(case: str) -> None:
-    """Three states are updated in one vmap, within a scan of a number of updates that N does not divide."""
+    """Three states are updated in one vmap, within a scan whose number of updates is not a multiple of N."""
     weighting = weighting_of(case)
     losses, compared = raw_gradients(0)
 
@@ -387,6 +387,6 @@ def test_losses_of_another_form_get_one_line(mode: Any) -> None:
 
 
 def test_every_weighting_with_a_main_loss_is_tried_here() -> None:
-    """`test_weighting_contract` tries all."""
+    """`test_weighting_contract` tests all of them."""
     assert {case.split()[0] for case in OPTIONS} == {name for name in WEIGHTINGS if make_weighting(name).main} | {"sum"}
     assert make_weighting("none").init((MAIN,)).weights == {MAIN: 1}

@@ -1,4 +1,4 @@
-"""Laws that every weighting keeps, whatever its method: its state, its numbers at extremes, and what its paper promises."""
+"""Contract of every weighting, whatever its method: its state, its numbers at extremes, and what its paper promises."""
 
 import functools
 from typing import Any
@@ -35,7 +35,7 @@ def flat(tree: Any) -> np.ndarray:
 
 @functools.cache
 def stepper(name: str) -> Any:
-    """(losses, gradients by name, state) -> (gradient in the shared parameters, weights, state, metrics), compiled."""
+    """Return a compiled function (losses, gradients by name, state) -> (shared gradient, weights, state, metrics)."""
     weighting = jw.make_weighting(name)
 
     def step(losses: Any, gradients: Any, state: Any) -> Any:
@@ -48,7 +48,7 @@ def stepper(name: str) -> Any:
 
 
 def take(name: str, rows: np.ndarray, losses: Any = (1.0, 1.0, 1.0), names: tuple[str, ...] = NAMES) -> tuple[np.ndarray, Any]:
-    """The first step from gradients [K, 8] and losses [K]: its gradient [8], and its weights."""
+    """Return the gradient [8] and the weights of the first step from gradients [K, 8] and losses [K]."""
     by_name = {each: jnp.float32(loss) for each, loss in zip(names, losses, strict=True)}
     gradients = {each: as_tree(row) for each, row in zip(names, rows, strict=True)}
     gradient, weights, _, _ = stepper(name)(by_name, gradients, begin(name, names))
@@ -61,7 +61,7 @@ def rows(seed: int = 0, count: int = 3) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ALL)
 def test_states_and_metrics_keep_their_structure(name: str) -> None:
-    """A state may be the carry of a scan; one that was saved as NumPy arrays goes on as it would have."""
+    """A state may be the carry of a scan; one that was saved as NumPy arrays continues in the same way."""
     losses = {each: jnp.float32(1.0 + place) for place, each in enumerate(NAMES)}
     gradients = {each: as_tree(row) for each, row in zip(NAMES, rows(), strict=True)}
     first, second = begin(name), None

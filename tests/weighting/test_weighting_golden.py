@@ -1,4 +1,4 @@
-"""Each method beside a transcription of its paper in NumPy, in float64; and the Gramian beside the explicit one."""
+"""Each method, compared with a float64 transcription of its paper in NumPy; and the Gramian, with the explicit one."""
 
 import contextlib
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ def in_float64() -> Iterator[None]:
 
 
 def gradients(seed: int = 0, count: int = 3, size: int = 6) -> np.ndarray:
-    """Gradients [K, size] of which two are in conflict."""
+    """Return gradients [K, size] of which two are in conflict."""
     rows = np.random.default_rng(seed).normal(size=(count, size))
     rows[1] -= rows[0]
     return rows
@@ -55,7 +55,7 @@ def test_projections_onto_the_cone_of_two_gradients_are_the_closed_form() -> Non
     assert one @ other < 0
 
     def project(vector: np.ndarray) -> np.ndarray:
-        """Project onto the directions that oppose neither: at most one of the two constraints holds with equality here."""
+        """Project onto the directions that oppose neither; at most one of the two constraints is active here."""
         for normal in (one, other):
             moved = vector - min(0.0, vector @ normal) * normal / (normal @ normal)
             if min(moved @ one, moved @ other) > -1e-9:
@@ -206,7 +206,7 @@ def test_graddrop_keeps_gradients_of_one_sign() -> None:
 
 
 def run(weighting: jw.Weighting, losses: np.ndarray, rows: np.ndarray | None = None) -> list[Any]:
-    """Steps [T] of a weighting from losses [T, 3], and gradients [T, 3, size] where it needs them."""
+    """Return the steps [T] of a weighting from losses [T, 3], and gradients [T, 3, size] where it needs them."""
     state = weighting.init(NAMES, jnp.zeros(rows.shape[-1]) if rows is not None else None)
     update, steps = jax.jit(weighting.update), []
     for place, values in enumerate(losses):
@@ -226,7 +226,7 @@ GRADIENTS = np.random.default_rng(8).normal(size=(6, 3, 5))
 
 
 class Adam:
-    """Adam in NumPy, of rates .9 and .999 and epsilon 1e-8."""
+    """Adam in NumPy, with decay rates 0.9 and 0.999 and epsilon 1e-8."""
 
     def __init__(self, size: int, rate: float) -> None:
         self.first, self.second, self.steps, self.rate = np.zeros(size), np.zeros(size), 0, rate
@@ -357,8 +357,8 @@ def explicit_gramian(params: Any, batch: Any) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def spying(seen: list[Any]) -> Iterator[jw.Weighting]:
-    """A weighting that needs a Gramian, and tells which it was given."""
+def recording_weighting(seen: list[Any]) -> Iterator[jw.Weighting]:
+    """Yield a weighting that needs a Gramian, and appends each one that it receives to ``seen``."""
     inner = jw.uniform()
 
     def update(losses: Any, statistics: Any, state: Any) -> Any:
@@ -376,7 +376,7 @@ def test_both_ways_find_the_explicit_gramian() -> None:
         @jax.jit
         def find(params: Any, batch: Any, mode: Any = mode) -> Any:
             seen: list[Any] = []
-            with spying(seen) as weighting:
+            with recording_weighting(seen) as weighting:
                 gradient = jw.weighted_grad(losses_of_latents, weighting, encoder_of, mode, encode=encode)
                 return gradient(params, weighting.init(tuple(params["heads"])), batch), seen[0]
 
@@ -403,7 +403,7 @@ def test_gramians_through_groups_of_latents_and_of_parts_of_a_batch() -> None:
     seen: list[Any] = []
 
     def on_parts(part: Any) -> Any:
-        with spying(seen) as weighting:
+        with recording_weighting(seen) as weighting:
             gradient = jw.weighted_grad(
                 losses, weighting, encoder_of, "latents", encode=groups, reduce=lambda tree: jax.lax.pmean(tree, "devices")
             )

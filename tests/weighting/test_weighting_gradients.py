@@ -1,4 +1,4 @@
-"""Gradients of weighted losses, and their dot products: all ways to find them against each other and finite differences."""
+"""Gradients of weighted losses and their dot products: all modes, compared with each other and with finite differences."""
 
 import functools
 from typing import Any
@@ -104,7 +104,7 @@ def test_latents_pass_the_encoder_as_often_for_many_losses() -> None:
 
 
 def halves(names: tuple[str, ...] = ("first", "second")) -> dict[str, Any]:
-    """Latents of the first and the second half of a minibatch, as two groups."""
+    """Return latents of the first and the second half of a minibatch, as two groups."""
     parts = dict(zip(("first", "second"), (slice(0, 6), slice(6, 12)), strict=True))
     return {name: functools.partial(encode_part, part=parts[name]) for name in names}
 
@@ -114,7 +114,7 @@ def encode_part(encoder: Any, batch: Any, part: slice) -> Any:
 
 
 def losses_of_halves(params: Any, latents: Any, batch: Any) -> dict[str, Any]:
-    """main reads the first half, near the second one, far both; of the first, main also reads what has no gradient."""
+    """Compute losses: main reads the first half, near the second, far both; main also reads the second without a gradient."""
     heads, first, second = params["heads"], latents["first"], latents["second"]
     still = jax.lax.stop_gradient(jnp.mean(second))
     return {

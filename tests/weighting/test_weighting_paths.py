@@ -28,7 +28,7 @@ def test_every_path_ends_on_the_front(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["mgda", "upgrad", "dualproj"])
 def test_no_loss_rises_but_by_the_length_of_a_step(name: str) -> None:
-    """Steps oppose no gradient, so that a loss gains at most half its greatest curvature, 4 or 16, times the squared step."""
+    """Steps oppose no gradient: a loss rises by at most half its greatest curvature, 4 or 16, times the squared step."""
     paths = pareto.descend(jw.make_weighting(name))
     squared = np.square(np.diff(paths.points, axis=1)).sum(axis=-1)
     assert (np.diff(paths.losses, axis=1) <= squared[..., None] * [2.0, 8.0] + 1e-5).all()
