@@ -1,4 +1,4 @@
-"""Recompute every published figure derived from learning records or audits, and list those that differ.
+"""Recompute every published number derived from learning records or audits, and list those that differ.
 
 python benchmarks/check_claims.py    # exit 1 if anything differs
 

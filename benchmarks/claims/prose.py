@@ -29,7 +29,7 @@ OTHERS: dict[str, tuple[str, ...]] = {
     "docs/lab/results.md": (),
     "README.md": (),
 }
-"""Numbers in the sentences of each page that are not results of learning, but settings, laws, speeds or task properties."""
+"""Numbers in the sentences of each page that are not results of learning, but settings, formulas, speeds or task properties."""
 
 
 @dataclasses.dataclass(frozen=True)

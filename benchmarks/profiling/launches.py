@@ -3,7 +3,7 @@
     python -m benchmarks.profiling.launches [TASK ...] [--environments 64]
 
 A control step is compiled for a CPU with the MJX engine, one physics step after the other, and its operations are counted after
-fusion: those of a loop as often as it turns. A GPU fuses some differently, but each of the rest is a launch, however little it
+fusion, those of a loop once per iteration. A GPU fuses some differently, but each of the rest is a launch, however little it
 computes. Where the scalar engine has a kernel for the task (`physics.scalar`), all physics steps become one launch, and only
 the operations outside of the loop over them remain.
 """
@@ -31,11 +31,12 @@ Counts = collections.Counter[str]
 
 
 def count_launches(program: str) -> tuple[Counts, Counts, int]:
-    """Count the operations of an optimized HLO program by kind.
+    """Count the operations of an optimized HLO program by opcode.
 
     Returns:
-        Operations outside of the loop with the most operations, those of one turn of that loop, and its turns. Operations of
-        other loops count as often as these turn; loops whose turns depend on data count as one turn and as "open loop".
+        Operations outside the loop with the most operations, operations of one iteration of that loop, and its number of
+        iterations. Operations in other loops are multiplied by their trip counts; each iteration also counts as one "loop
+        iteration". A loop whose trip count depends on data counts as one iteration, called "open loop".
     """
     computations: dict[str, list[str]] = {}
     entry = name = ""

@@ -218,7 +218,7 @@ def _figures(file: Path) -> list[dict[str, Any]]:
 
 
 def worker_of_grasping(folder: Path, rng: random.Random, references: "References") -> None:
-    """Kill a worker of ``grasp eval``; the next start gives the same figures."""
+    """Kill a worker of ``grasp eval``; the next start gives the same results."""
     spec, figures = references.grasping()
     _check_pool(_grasp_arguments(folder, spec), folder, rng)
     if _figures(folder / "eval.json") != figures:

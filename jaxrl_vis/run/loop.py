@@ -379,7 +379,7 @@ class RunLoop:
         return self._programs.pending(outcome)
 
     def _evaluate(self, report: Report, outcome: PendingMetrics) -> Report:
-        """Read the results of an evaluation, write a line per seed, and add the figures to the report."""
+        """Read the results of an evaluation, write a line per seed, and add the metrics to the report."""
         progress, speed = self._progress, self._pace.speed(self._done)
         values = outcome.read_per_seed(self._config.run.seeds)
         if not all(np.isfinite(row).all() for row in values.values()):

@@ -127,7 +127,7 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
 
     def step(with_actor: bool, train: TrainState, replay: ReplayState, choice: Choice) -> tuple[TrainState, jax.Array, Any]:
         working = algorithm.begin(train.agent, train.statistics)
-        # The actor's gradient is computed in every step, but applied only in the actor's turns.
+        # The actor's gradient is computed in every step, but applied only in steps that update the actor.
         gradients, metrics = algorithm.gradients(working, algorithm.prepare(working, sampler.batch(replay, choice)), True)
         losses = jnp.stack([metrics["train/critic_loss"], metrics["train/actor_loss"]])
         taken = gradients if with_actor else gradients._replace(actor=None)
@@ -314,7 +314,7 @@ def measure(program: TrainStep, train: TrainState, replay: ReplayState, repeats:
         program: Our program, one call of which takes ``updates_per_iteration`` steps.
         train, replay: State of one seed, without the seed's axis.
         repeats: Maximum number of timed repeats.
-        ours: Our figure for the same configuration.
+        ours: Our measurement for the same configuration.
 
     Raises:
         AssertionError: PyTorch does not compute what we do.

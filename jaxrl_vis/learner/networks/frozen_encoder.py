@@ -26,7 +26,7 @@ _LIMIT = 5.0  # clipping bound of normalised values, the default of ``normalizer
 def save(path: Path | str, encoder: Params, scaling: Scaling) -> None:
     """Write an encoder to a file: parameters of `modules.Encoder`, and the scaling of its images [C, H, W].
 
-    ``.npz`` is appended to the name unless it ends so (`numpy.savez`).
+    ``.npz`` is appended to the name unless it ends in it (`numpy.savez`).
     """
     arrays = {name: leaf for name, leaf in encoder.items() if name != "latent"}
     arrays |= {f"latent/{name}": leaf for name, leaf in encoder["latent"].items()}

@@ -53,7 +53,7 @@ class TensorBoard:
             writer.flush()
 
     def rows(self, rows: Sequence[Row]) -> None:
-        """Log the figures of rows at their ``env_steps``."""
+        """Log the metrics of rows at their ``env_steps``."""
         for row in rows:
             values = [summary_pb2.Summary.Value(tag=name, simple_value=value) for name, value in scalars(row).items()]
             self._write(row["seed"], row["env_steps"], summary=summary_pb2.Summary(value=values))

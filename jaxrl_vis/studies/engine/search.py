@@ -133,8 +133,8 @@ def run_search(
         True if all trials have ended.
 
     Raises:
-        RequestError: No option varies or one does twice, Optuna is missing, the folder holds another search, or see
-            `run_cells`.
+        RequestError: No option varies or one does twice, Optuna is missing, or the folder holds another search; see
+            also `run_cells`.
         KeyboardInterrupt, Terminated: A signal arrived; raised after all runs have saved.
     """
     if not request.ranges:

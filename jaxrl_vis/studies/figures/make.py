@@ -4,7 +4,7 @@ FIGURE.png   lines of finished cells; in figures 5.4, 5.5 and 5.7 also those rel
 FIGURE.md    tables, and a description of the runs
 FIGURE.csv   the same numbers, for further processing
 
-`ol_aux`, `indicator` and `goals` define the runs of a figure; files with similar names in this folder their presentation.
+`ol_aux`, `indicator` and `goals` define the runs of a figure; files with similar names in this folder define how it looks.
 """
 
 from collections.abc import Callable, Sequence
