@@ -403,7 +403,7 @@ class RunLoop:
                 rows = [row for row in rows if row["seed"] not in self._evaluated_seeds]
             with self._saver.writing():
                 metrics.append_rows(self._folder.metrics, rows)
-            self._loggers.rows(rows)
+            self._loggers.log_rows(rows)
         progress.evaluation_due = False
         self._warn_if_filtered(means)
         # The last evaluation may lie between two scheduled ones; a longer run, resumed from here, continues the means.

@@ -181,7 +181,7 @@ def test_tables_go_between_their_markers(page: Path, tmp_path: Path) -> None:
     folder = tmp_path
     with pytest.raises(RequestError, match="speed table: begin"):
         list(pages.write_pages(folder, folder))
-    assert list(pages.outdated(folder, folder))[0].startswith(f"{tables.PAGE}: there are no markers")
+    assert list(pages.outdated_page_messages(folder, folder))[0].startswith(f"{tables.PAGE}: there are no markers")
     with page.open("a") as file:
         file.write("<!-- speed table: begin (so) -->\n<!-- speed table: end -->\nafter\n")
     assert list(pages.write_pages(folder, folder)) == [(page, True)]

@@ -56,7 +56,7 @@ def slope(speed: float) -> Callable[[int], float]:
 
 def all_cells(figure: str, tasks=(), variants=(), **scope) -> dict[tuple[str, str], list[Cell]]:
     study = STUDIES[figure]
-    return make_cells(study, tasks or tuple(study.steps), variants or (*study.extra, *study.variants), Scope(**scope))
+    return make_cells(study, tasks or tuple(study.steps), variants or (*study.extra_variants, *study.variants), Scope(**scope))
 
 
 def test_the_cells_are_those_of_the_issue() -> None:

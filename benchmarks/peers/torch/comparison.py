@@ -139,9 +139,9 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
     losses, gradients = [], []
     with jax.default_matmul_precision("highest"):
         for index in range(STEPS):
-            turn = (index + 1) % config.ddpg.actor_interval == 0
+            with_actor = (index + 1) % config.ddpg.actor_interval == 0
             choice = jax.tree.map(lambda leaf, index=index: leaf[index], choices)
-            now, step_losses, step_gradients = jax.device_get(stepped(turn, now, replay, choice))
+            now, step_losses, step_gradients = jax.device_get(stepped(with_actor, now, replay, choice))
             losses.append(step_losses)
             gradients.append(step_gradients)
     names = ("actor", "critic", "target_actor", "target_critic")

@@ -82,7 +82,7 @@ class WeightsAndBiases:
     def _write_state(self) -> None:
         write_atomically(self._state_file, json.dumps(self._state, indent=2) + "\n")
 
-    def rows(self, rows: Sequence[Row]) -> None:
+    def log_rows(self, rows: Sequence[Row]) -> None:
         """Log the metrics of new rows against ``env_steps``; W&B's own step is the iteration."""
         for row in rows:
             known = self._state[str(row["seed"])]
@@ -93,7 +93,7 @@ class WeightsAndBiases:
             known["iteration"] = row["iteration"]
         self._write_state()
 
-    def image(self, name: str, file: Path, env_steps: int) -> None:
+    def log_image(self, name: str, file: Path, env_steps: int) -> None:
         """Log the unchanged file in the first seed's W&B run, at the iteration of its latest row."""
         seed, run = next(iter(self._runs.items()))
         media = wandb.Video(str(file), format="gif") if file.suffix == ".gif" else wandb.Image(str(file))

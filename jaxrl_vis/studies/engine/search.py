@@ -227,7 +227,7 @@ class _Search:
             if left is not None and left <= 0:
                 return False
             failures = run_cells(list(cells.values()), request.runs, find_once, left, self._command, self._echo)
-            if not self._tell(cells, failures):
+            if not self._report_scores(cells, failures):
                 return False
 
     def _cells(self, batch: Mapping[int, Mapping[str, Any]]) -> dict[int, Cell]:
@@ -245,7 +245,7 @@ class _Search:
                 self._study.tell(number, state=self._state.FAIL)
         return cells
 
-    def _tell(self, cells: Mapping[int, Cell], failures: Sequence[str]) -> bool:
+    def _report_scores(self, cells: Mapping[int, Cell], failures: Sequence[str]) -> bool:
         """Report the scores of trials to Optuna; return False if one has not ended, because time is up."""
         for number, cell in cells.items():
             rows = finished_rows(cell, self._request.runs)

@@ -45,7 +45,7 @@ def make_figure(request: Request, echo: Callable[[str], None] = streams.echo) ->
     """
     study = request.study
     tasks, variants = request.tasks or tuple(study.steps), request.variants or study.variants
-    extra = tuple(name for name in study.extra if name not in variants)
+    extra = tuple(name for name in study.extra_variants if name not in variants)
     cells = make_cells(study, tasks, (*extra, *variants), request.scope)
     if not request.draw_only:
         # A cell requested by several figures or methods is trained once.
