@@ -176,10 +176,12 @@ def weighted_grad(
     if mode not in get_args(GradientMode):
         raise RequestError(f"unknown gradient mode {mode!r}{nearest(mode, get_args(GradientMode))}")
     if mode == "latents" and weighting.needs == "gradients":
-        raise RequestError(f"weighting {weighting.name} needs whole gradients, which latents does not find; use per_loss")
+        raise RequestError(
+            f"weighting {weighting.name} needs whole gradients, which mode latents does not compute; use per_loss"
+        )
     if mode == "latents":
         if encode is None:
-            raise RequestError("mode latents needs to know what the latents are: give encode")
+            raise RequestError("mode latents needs encode, the function that computes the latents")
         return functools.partial(_gradient_by_latents, losses_fn, weighting, shared, has_aux, reduce, forwards, encode)
 
     def encoded_losses(params: Params, *args: Any) -> Any:

@@ -125,7 +125,7 @@ def test_a_missing_or_wrong_encoder_gets_one_line(tmp_path):
         arrays = dict(file)
     np.savez(tmp_path / "cut.npz", **{**arrays, "kernel_1": arrays["kernel_1"][:3]})
     for name in ("other", "text", "missing", "cut"):
-        with pytest.raises(RequestError, match=f"{name}.npz is no encoder") as refused:
+        with pytest.raises(RequestError, match=f"{name}.npz is not an encoder") as refused:
             make_reward(config.replace(reward_encoder=str(tmp_path / f"{name}.npz")), METHODS["features"])
         assert "\n" not in str(refused.value)
     encode = frozen_encoder.load(tmp_path / "encoder.npz")

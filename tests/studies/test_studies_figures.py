@@ -389,7 +389,7 @@ def test_seeds_of_several_runs_are_one_line(tmp_path: Path) -> None:
         (["5.4", "--minutes", "3", "--draw-only"], ["leave out --minutes"]),
         (["5.6", "--methods", "ol_aux_5", "ol_aux_1"], ["weights of one method", "ol_aux_1"]),
         (["5.6", "--methods", "sum"], ["weights of one method that learns them", "ol_aux_5"]),
-        (["5.4", "--runs", "nowhere", "--draw-only"], ["--runs nowhere is no folder", "--draw-only draws trained runs"]),
+        (["5.4", "--runs", "nowhere", "--draw-only"], ["--runs nowhere is not a folder", "--draw-only draws trained runs"]),
         (["5.4", "--runs", "/proc/x"], ["cannot write --runs /proc/x"]),
         (["5.4", "--out", "x.gif"], ["--out x.gif", ".png"]),
         (["quadratic", "--tasks", FETCH], ["--tasks", "not with quadratic"]),

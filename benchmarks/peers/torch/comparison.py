@@ -67,7 +67,7 @@ def load() -> Any:
     try:
         learner = importlib.import_module("benchmarks.peers.torch.learner")
     except ImportError as error:
-        raise RequestError(f"the peer torch needs PyTorch, which is no dependency: pip install torch ({error})") from error
+        raise RequestError(f"the peer torch needs PyTorch, which is not a dependency: pip install torch ({error})") from error
     if jax.default_backend() == "gpu" and not learner.torch.cuda.is_available():
         raise RequestError(f"the peer torch needs a PyTorch that sees the GPU; {learner.torch.__version__} does not")
     return learner

@@ -52,10 +52,10 @@ def load(path: Path | str) -> Callable[[jax.Array], jax.Array]:
         jax.eval_shape(lambda images: encoder.apply(params, to_blocks(images, len(filters))), blocks)
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise RequestError(
-            f"{path} is no encoder that jaxrl-vis encoder wrote: {' '.join(str(error).split())[:120]}"
+            f"{path} is not an encoder that jaxrl-vis encoder wrote: {' '.join(str(error).split())[:120]}"
         ) from error
     except Exception as error:  # flax raises its own exceptions for parameters of the wrong shape
-        raise RequestError(f"{path} is no encoder: its arrays do not fit together") from error
+        raise RequestError(f"{path} is not an encoder: its arrays do not fit together") from error
 
     def encode(images: jax.Array) -> jax.Array:
         if images.shape[1:] != shape:

@@ -73,7 +73,7 @@ def _read_line(line: bytes) -> dict[str, Any] | str:
     except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
         return "is damaged"
     if not isinstance(row, dict) or not all(is_count(row.get(name)) for name in RowKeys._fields):
-        return f"is no row: {', '.join(RowKeys._fields)} must be numbers"
+        return f"is not a row: {', '.join(RowKeys._fields)} must be numbers"
     return row
 
 

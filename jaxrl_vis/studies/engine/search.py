@@ -81,7 +81,7 @@ def read_range(text: str) -> Range:
             raise RequestError(f"--vary {text}: name two values or more, or set it with --{name.replace('_', '-')}")
         return Range(name, words=words)
     if fields.unwrap(OPTIONS[name].hint)[0] not in (int, float) or fields.unwrap(OPTIONS[name].hint)[2]:
-        raise RequestError(f"--vary {text}: {name} is no number: list its values, NAME=VALUE,VALUE")
+        raise RequestError(f"--vary {text}: {name} is not a number: list its values, NAME=VALUE,VALUE")
     ends, _, scale = values.partition(",")
     low, high = (_read(name, word) for word in ends.split("..", 1))
     if scale not in ("", "log") or not low < high or (scale and low <= 0):
@@ -186,7 +186,7 @@ def _open(optuna: Any, request: Request) -> Any:
     except OSError as error:
         raise RequestError(f"cannot write to {request.runs} ({error.strerror or error}): choose another --runs") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise RequestError(f"{file} is no journal of a search: move it away, or choose another --runs") from error
+        raise RequestError(f"{file} is not a journal of a search: move it away, or choose another --runs") from error
     if earlier is not None and earlier != asked:
         names = [name for name in asked if not isinstance(earlier, dict) or earlier.get(name) != asked[name]]
         shown = ", ".join(names[:3]) or "its options"
