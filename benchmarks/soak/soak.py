@@ -67,7 +67,7 @@ class Soak:
             return deck.pop()
 
     def _return_fault(self, faults: dict[str, Any], fault: str) -> None:
-        """Return a fault to the deck, because the run had finished before it."""
+        """Put a fault back into the deck, because the run had finished before it."""
         with self._lock:
             self._left += 1
             self._decks[next(iter(faults))].insert(0, fault)

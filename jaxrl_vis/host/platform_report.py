@@ -102,7 +102,7 @@ def report(path: Path) -> int:
 
 
 def to_record(findings: dict[str, Any], training: dict[str, Any] | None) -> dict[str, Any]:
-    """Record what ran on this machine.
+    """Return the record of what ran on this machine.
 
     Args:
         findings: From `doctor.main`.

@@ -355,7 +355,7 @@ class RunLoop:
         return Report(iteration, iteration * env_steps, iteration * updates, values)
 
     def _read(self) -> Report:
-        """Wait for the metrics of the oldest unread iteration, and record them.
+        """Wait for the metrics of the oldest unread iteration, record them, and return their report.
 
         Raises:
             NonFiniteError: A guard metric is not 0.

@@ -101,7 +101,7 @@ class HeldLock:
 
 @contextlib.contextmanager
 def run_lock(folder: Path, echo: Callable[[str], None] = print) -> Iterator[HeldLock]:
-    """Lock a run folder; create it if missing, and remove it again if it is still empty at the end.
+    """Lock a run folder and yield the lock. Create the folder if missing, and remove it if it is still empty at the end.
 
     Args:
         folder: The folder.
