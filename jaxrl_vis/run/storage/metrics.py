@@ -168,10 +168,10 @@ def _read_row(line: bytes) -> dict[str, Any] | None:
         return None
     if not isinstance(row.get(RUN_ID), str | None):
         return None
-    return row if all(name == RUN_ID or _is_figure(value) for name, value in row.items()) else None
+    return row if all(name == RUN_ID or _is_metric(value) for name, value in row.items()) else None
 
 
-def _is_figure(value: Any) -> bool:
+def _is_metric(value: Any) -> bool:
     if isinstance(value, int) and not isinstance(value, bool):
         return abs(value) < _MAX_VALUE
     return value is None or (isinstance(value, float) and math.isfinite(value))
