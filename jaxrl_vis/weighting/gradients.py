@@ -181,7 +181,7 @@ def weighted_grad(
         )
     if mode == "latents":
         if encode is None:
-            raise RequestError("mode latents needs encode, the function that computes the latents")
+            raise RequestError("mode latents needs the function that computes the latents: give encode")
         return functools.partial(_gradient_by_latents, losses_fn, weighting, shared, has_aux, reduce, forwards, encode)
 
     def encoded_losses(params: Params, *args: Any) -> Any:
