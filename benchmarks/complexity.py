@@ -146,7 +146,7 @@ def measure(with_calls: bool = True) -> dict[str, Any]:
 def main() -> int:
     """Print the measures, and write them to ``--json`` if given; return 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path, help="a file for the figures")
+    parser.add_argument("--json", type=Path, help="file for the measures")
     parser.add_argument("--without-calls", action="store_true", help="trace nothing")
     options = parser.parse_args()
     measured = measure(not options.without_calls)

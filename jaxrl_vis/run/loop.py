@@ -432,7 +432,7 @@ class RunLoop:
         self._progress.filtered = self._progress.filtered + 1 if too_much else 0
         if self._progress.filtered == _FILTERED_EVALUATIONS:
             self._echo(
-                f"warning: more than {_FILTERED_TOO_MUCH:.0%} of the negatives were filtered since "
+                f"warning: more than {_FILTERED_TOO_MUCH:.0%} of the negatives were filtered in the last "
                 f"{_FILTERED_EVALUATIONS} evaluations: Q lies above q0 almost everywhere and cannot come down; "
                 "check reward_positive, reward_negative and filter_threshold"
             )

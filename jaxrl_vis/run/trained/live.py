@@ -62,7 +62,7 @@ class Session:
     def __init__(self, policy: Policy, seed: int = 0):
         env = policy.env
         if not isinstance(env, MjxGoalEnv):
-            raise RequestError(f"--live shows tasks on MJX, and {policy.env_name} is none: leave it out for a video")
+            raise RequestError(f"--live shows tasks on MJX, and {policy.env_name} is not one: leave it out for a video")
         self.env, self._policy, self._keys = env, policy, map(jax.random.key, itertools.count(seed))
 
         def begin(key: jax.Array) -> tuple[Any, Any]:
