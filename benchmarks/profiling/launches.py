@@ -1,4 +1,4 @@
-"""Operations of a control step that a GPU would launch one after the other, counted without one.
+"""Operations of a control step that a GPU would launch one after the other, counted without a GPU.
 
     python -m benchmarks.profiling.launches [TASK ...] [--environments 64]
 

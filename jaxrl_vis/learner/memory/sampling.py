@@ -42,7 +42,7 @@ class Choice(NamedTuple):
         target_key: [] typed key, for targets of auxiliary tasks; None without any.
         clutter_end: [] float32, see `reward_errors`; None if false rewards are not confined.
         is_replaceable: [B] bool, mask of relabelled goals to be replaced by another transition's if they are already reached;
-            None if none is, or if true states have decided that (``goal_episode``).
+            None if there are none, or if true states have determined them (``goal_episode``).
     """
 
     indices: Indices
