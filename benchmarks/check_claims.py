@@ -1,4 +1,4 @@
-"""Recompute every published figure derived from learning records or audits, and list those that differ.
+"""Recompute every published number derived from learning records or audits, and list those that differ.
 
 python benchmarks/check_claims.py    # exit 1 if anything differs
 
@@ -14,7 +14,7 @@ from benchmarks.claims import pages, prose, sentences
 from benchmarks.ledger import pages as ledger
 from benchmarks.ledger.records import CHECKOUT
 
-OF_LEARNING = {
+LEARNING_TABLES = {
     "docs/lab/results.md": "results table",
     "docs/lab/target_decay.md": "tables",
     "docs/lab/ablations.md": "curves",
@@ -24,8 +24,8 @@ OF_LEARNING = {
 
 
 def ledger_differences() -> Iterator[str]:
-    """Yield a line for each table of `OF_LEARNING` that differs from the records."""
-    for page, name in OF_LEARNING.items():
+    """Yield a line for each table of `LEARNING_TABLES` that differs from the records."""
+    for page, name in LEARNING_TABLES.items():
         text = (CHECKOUT / page).read_text(encoding="utf-8")
         if ledger.fill_page(text, {name: ledger.PAGES[page][name]}) != text:
             yield f"{page}: the table {name!r} differs from the records: make tables"

@@ -114,7 +114,7 @@ def calls() -> list[str]:
 
 
 def measure(with_calls: bool = True) -> dict[str, Any]:
-    """Compute all figures by name; all but "fullest folder" and "lines of the stalks" exclude the stalks product.
+    """Compute all measures by name; all but "fullest folder" and "lines of the stalks" exclude the stalks product.
 
     Args:
         with_calls: Whether to include the calls to the critic's loss, which takes some seconds.
@@ -144,9 +144,9 @@ def measure(with_calls: bool = True) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Print the figures, and write them to ``--json`` if given; return 0."""
+    """Print the measures, and write them to ``--json`` if given; return 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path, help="a file for the figures")
+    parser.add_argument("--json", type=Path, help="file for the measures")
     parser.add_argument("--without-calls", action="store_true", help="trace nothing")
     options = parser.parse_args()
     measured = measure(not options.without_calls)

@@ -3,8 +3,8 @@
     python -m benchmarks.exported [NAME ...] [--episodes 256]
 
 Each policy is exported, checked against its golden frames, and run for a number of fresh episodes twice: by JAX and by
-onnxruntime, with equal starts and goals. Latency is that of one observation and goal, images in memory, one thread. Record:
-exported-DEVICE.json, with a row for each policy; docs/export.md has a table of it.
+onnxruntime, with equal starts and goals. Latency is measured with one observation and one goal in memory, on one thread.
+Record: exported-DEVICE.json, with a row for each policy; docs/export.md has a table of it.
 """
 
 import argparse

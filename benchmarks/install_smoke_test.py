@@ -148,7 +148,7 @@ def mistakes() -> list[tuple[str, Mapping[str, str]]]:
     return [*((line, {}) for line in lines), *without_gpu]
 
 
-def wheel(shell: Shell, python: Path) -> None:
+def check_wheel(shell: Shell, python: Path) -> None:
     """Test the installation of a wheel with pip, and the program's commands; failures are added to ``shell.failures``.
 
     Args:
@@ -205,7 +205,7 @@ def tiny(line: str) -> str:
     return shlex.join(words)
 
 
-def clone(shell: Shell, python: Path) -> None:
+def check_clone(shell: Shell, python: Path) -> None:
     """Test the installation of a clone with make, and the commands of docs/start.md; failures are added to ``shell.failures``.
 
     Args:
@@ -228,7 +228,7 @@ def clone(shell: Shell, python: Path) -> None:
         shell.failures.append(f"left in the checkout: {' '.join(untracked.split())}")
 
 
-def notebooks(shell: Shell, python: Path, full: bool) -> None:
+def check_notebooks(shell: Shell, python: Path, full: bool) -> None:
     """Test the notebooks, in a separate folder, in a Jupyter without this project; failures are added to ``shell.failures``.
 
     Args:
@@ -280,11 +280,11 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"\n== {method}, {python.name} ==", flush=True)
             shell = new_shell(top / f"{method}-{python.name}", python)
             if method == "wheel":
-                wheel(shell, python)
+                check_wheel(shell, python)
             elif method == "clone":
-                clone(shell, python)
+                check_clone(shell, python)
             else:
-                notebooks(shell, python, options.full)
+                check_notebooks(shell, python, options.full)
             failures += [f"{method}, {python.name}: {failure}" for failure in shell.failures]
     print(f"\n{len(failures)} commands were not as expected" if failures else "\nall as expected")
     for failure in failures:

@@ -32,8 +32,8 @@ from jaxrl_vis_envs.base import State
 Recording = Mapping[str, np.ndarray]
 
 
-class Figure(NamedTuple):
-    """Deviation from the recording, in ``unit``; ``bound`` is its maximum permitted value, None if it is only informative."""
+class Measure(NamedTuple):
+    """Measure of the agreement with a recording; ``bound`` is its maximum permitted value, None if it is only informative."""
 
     name: str
     value: float
@@ -67,15 +67,15 @@ def play(env: Any, state: State, actions: np.ndarray) -> tuple[np.ndarray, np.nd
     return np.stack(qpos, axis=1), np.stack(achieved, axis=1)
 
 
-def distance_figures(name: str, error: np.ndarray, median: float | None, high: float | None, percentile: int) -> list[Figure]:
+def distance_measures(name: str, error: np.ndarray, median: float | None, high: float | None, percentile: int) -> list[Measure]:
     """Return the median and a percentile of ``error`` [...], with their bounds ``median`` and ``high``, None for none; m."""
     return [
-        Figure(f"{name}: median error", float(np.median(error)), "m", median),
-        Figure(f"{name}: {percentile}th percentile of the error", float(np.percentile(error, percentile)), "m", high),
+        Measure(f"{name}: median error", float(np.median(error)), "m", median),
+        Measure(f"{name}: {percentile}th percentile of the error", float(np.percentile(error, percentile)), "m", high),
     ]
 
 
-def fetch_reach(recording: Recording) -> list[Figure]:
+def fetch_reach(recording: Recording) -> list[Measure]:
     """Compare grip positions, until the recorded one leaves the neighbourhood of its start."""
     env = environments.make("FetchReach")
     actions, recorded = _take(recording, "actions", "grip_pos_m")
@@ -87,12 +87,12 @@ def fetch_reach(recording: Recording) -> list[Figure]:
     is_inside = np.cumsum(is_outside, axis=1) == 0
     error = np.linalg.norm(grip - recorded[:, 1:], axis=-1)[is_inside[:, 1:]]
     return [
-        Figure("share of the recording that counts (near the start)", float(is_inside.mean()), ""),
-        *distance_figures("grip", error, 0.005, 0.015, 99),
+        Measure("share of the recording that counts (near the start)", float(is_inside.mean()), ""),
+        *distance_measures("grip", error, 0.005, 0.015, 99),
     ]
 
 
-def fetch_push(recording: Recording) -> list[Figure]:
+def fetch_push(recording: Recording) -> list[Measure]:
     """Compare the grip until the box first moves, the time of that move, and the box's final position; check that it moves."""
     env = environments.make("FetchPush")
     actions, recorded = _take(recording, "actions", "observations")
@@ -102,11 +102,11 @@ def fetch_push(recording: Recording) -> list[Figure]:
     grip_error, box_error = (np.linalg.norm((ours - recorded)[..., part], axis=-1) for part in (slice(3), slice(3, 6)))
     moved = np.linalg.norm(recorded[:, -1, 3:6] - recorded[:, 0, 3:6], axis=-1)
     return [
-        Figure("share of sequences in which the box moves less than 5 cm", float((moved < 0.05).mean()), "", 0.2),
-        Figure("grip until the box moves: median error", float(np.median(grip_error[is_before])), "m"),
-        Figure("grip until the box moves: greatest error", float(grip_error[is_before].max()), "m", 0.002),
-        Figure("first move of the box: greatest error", float(np.abs(our_start - start).max()), "steps", 1.0),
-        *distance_figures("box at the end", box_error[:, -1], 0.01, None, 95),
+        Measure("share of sequences in which the box moves less than 5 cm", float((moved < 0.05).mean()), "", 0.2),
+        Measure("grip until the box moves: median error", float(np.median(grip_error[is_before])), "m"),
+        Measure("grip until the box moves: greatest error", float(grip_error[is_before].max()), "m", 0.002),
+        Measure("first move of the box: greatest error", float(np.abs(our_start - start).max()), "steps", 1.0),
+        *distance_measures("box at the end", box_error[:, -1], 0.01, None, 95),
     ]
 
 
@@ -134,9 +134,9 @@ def _first_move(observations: np.ndarray) -> np.ndarray:
     return np.where(has_moved.any(axis=1), has_moved.argmax(axis=1), observations.shape[1])
 
 
-def finger_turn(recording: Recording) -> list[Figure]:
+def finger_turn(recording: Recording) -> list[Measure]:
     """Compare final joint angles with K physics steps per control step, for each recorded K; only the task's 21 is bounded."""
-    figures = []
+    measures = []
     for substeps in (21, 2):
         keys = (f"qpos_rad_nsub{substeps}", f"qvel_rad_s_nsub{substeps}")
         if substeps == 2 and not any(key in recording for key in keys):
@@ -146,12 +146,12 @@ def finger_turn(recording: Recording) -> list[Figure]:
         ours, _ = play(env, environments.start_at(env, qpos[:, 0], qvel[:, 0]), actions)
         error = np.abs(ours[:, -1] - qpos[:, -1]).max(axis=-1)
         name = f"{substeps} substeps, joint and spinner angles at the end: "
-        figures += [
-            Figure(name + "greatest error", float(error.max()), "rad", 0.01 if substeps == 21 else None),
-            Figure(name + "median error", float(np.median(error)), "rad"),
-            Figure(f"{substeps} substeps, sequences that move the spinner > 0.3 rad", _share_moving(qpos), ""),
+        measures += [
+            Measure(name + "greatest error", float(error.max()), "rad", 0.01 if substeps == 21 else None),
+            Measure(name + "median error", float(np.median(error)), "rad"),
+            Measure(f"{substeps} substeps, sequences that move the spinner > 0.3 rad", _share_moving(qpos), ""),
         ]
-    return figures
+    return measures
 
 
 def _share_moving(qpos: np.ndarray) -> float:
@@ -159,10 +159,10 @@ def _share_moving(qpos: np.ndarray) -> float:
     return float((np.ptp(qpos[:, :, 2], axis=1) > 0.3).mean())
 
 
-def hand_reach(recording: Recording) -> list[Figure]:
+def hand_reach(recording: Recording) -> list[Measure]:
     """Compare fingertips with contacts and, to show that the bounds are sensitive to these, without."""
     actions, qpos, tips = _take(recording, "actions", "qpos", "tip_pos_m")
-    figures = []
+    measures = []
     for contacts in (True, False):
         env = environments.make("HandReach", contacts=contacts)
         _, ours = play(env, environments.start_at(env, qpos[:, 0], np.zeros_like(qpos[:, 0])), actions)
@@ -170,11 +170,11 @@ def hand_reach(recording: Recording) -> list[Figure]:
         for number, finger in enumerate(("first finger", "middle finger", "ring finger", "little finger", "thumb")):
             name = finger if contacts else f"without contacts, {finger}"
             bounds = (0.002, 0.008) if contacts else (None, None)
-            figures += distance_figures(name, error[..., number], *bounds, 95)
-    return figures
+            measures += distance_measures(name, error[..., number], *bounds, 95)
+    return measures
 
 
-def reacher(recording: Recording) -> list[Figure]:
+def reacher(recording: Recording) -> list[Measure]:
     """Compare joint angles and the fingertip under torque control."""
     env = environments.make("Reacher", control="torque")
     actions, qpos, qvel, fingertip = _take(recording, "actions", "qpos_rad", "qvel_rad_s", "fingertip_pos_m")
@@ -182,13 +182,13 @@ def reacher(recording: Recording) -> list[Figure]:
     error = np.abs(our_qpos - qpos[:, 1:])
     tip_error = np.linalg.norm(our_fingertip - fingertip[:, 1:, :2], axis=-1)
     return [
-        Figure("joint angles: median error", float(np.median(error)), "rad", 0.01),
-        Figure("joint angles: 99th percentile of the error", float(np.percentile(error, 99)), "rad"),
-        *distance_figures("fingertip", tip_error, 0.001, None, 99),
+        Measure("joint angles: median error", float(np.median(error)), "rad", 0.01),
+        Measure("joint angles: 99th percentile of the error", float(np.percentile(error, 99)), "rad"),
+        *distance_measures("fingertip", tip_error, 0.001, None, 99),
     ]
 
 
-COMPARISONS: dict[str, Callable[[Recording], list[Figure]]] = {
+COMPARISONS: dict[str, Callable[[Recording], list[Measure]]] = {
     "FetchPush": fetch_push,
     "FetchReach": fetch_reach,
     "FingerTurn": finger_turn,
@@ -197,7 +197,7 @@ COMPARISONS: dict[str, Callable[[Recording], list[Figure]]] = {
 }
 
 
-def compare(name: str, recording: Recording) -> list[Figure]:
+def compare(name: str, recording: Recording) -> list[Measure]:
     """Compare an environment with a recording; image variants are compared through their state variants.
 
     Raises:
@@ -234,13 +234,13 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         with np.load(options.file) as recording:
-            figures = compare(options.env, recording)
+            measures = compare(options.env, recording)
     except (OSError, NothingToCompareError) as error:
         print(f"parity: {error}", file=sys.stderr)
         return 2
-    for figure in figures:
-        print(figure)
-    return 1 if any(figure.is_broken for figure in figures) else 0
+    for measure in measures:
+        print(measure)
+    return 1 if any(measure.is_broken for measure in measures) else 0
 
 
 if __name__ == "__main__":

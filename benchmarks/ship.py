@@ -103,7 +103,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=256, help="fresh episodes of the evaluation")
     options = parser.parse_args()
     if not options.name.isidentifier() or options.name != options.name.lower():
-        sys.exit(f"{options.name} is no lower-case word")
+        sys.exit(f"{options.name} is not a lower-case word")
     checkpoint = int(options.checkpoint) if (options.checkpoint or "").isdecimal() else options.checkpoint
     try:
         result = ship(options.run, options.name, checkpoint, options.seed, options.episodes)

@@ -127,7 +127,7 @@ def main() -> None:
     parser.add_argument("env", nargs="?", default="VisualFetchReach")
     parser.add_argument("--preset")
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the times")
     parser.add_argument("--mode", choices=MODES, help=argparse.SUPPRESS)  # for its child processes
     options = parser.parse_args()
     if options.mode:

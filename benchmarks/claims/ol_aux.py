@@ -127,7 +127,7 @@ def _departures() -> str:
     return table(["VisualFetchReach, seeds 0 to 9"], rows, columns)
 
 
-def _gaps() -> str:
+def _undone_departures() -> str:
     """Return the table of runs with one or more departures from the authors' release undone, on hand and finger."""
     hand = [
         ("VisualHandReach, `paper`", run(HAND, "none")),
@@ -225,6 +225,6 @@ def tables() -> dict[str, dict[str, str]]:
             "fresh_finger": _fresh(FINGER),
             "options": _options(),
             "departures": _departures(),
-            "gaps": _gaps(),
+            "gaps": _undone_departures(),
         },
     }

@@ -1,7 +1,7 @@
 """Check of numbers quoted in prose: a page must contain each sentence registered in `sentences`, with the computed numbers.
 
-The check fails if a page is edited without the record, or a record changes without the page. On the pages of `OTHERS`, decimal
-fractions outside tables, code and generated sections that are in no registered sentence are also reported.
+The check fails if a page is edited without the record, or a record changes without the page. On the pages of `OTHER_NUMBERS`,
+decimal fractions outside tables, code and generated sections that are in no registered sentence are also reported.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from benchmarks.ledger.records import CHECKOUT
 
 _TESTS = ("p at most .05", "p is at most .05", "has p of at most .05", "cannot be less than .008")
-OTHERS: dict[str, tuple[str, ...]] = {
+OTHER_NUMBERS: dict[str, tuple[str, ...]] = {
     "docs/lab/ol_aux.md": ('"Steps to 0.5"', "(p < .05)", "keep 0.95", "decay of 0.95", "rank correlation of +1.0"),
     "docs/lab/indicator.md": ("(0.16 to 0.19)", "0.1 m"),
     "docs/lab/learner_options.md": ("0.16 to 0.19 of the goals", "with 0.1 the actor", "chance is 0.18"),
@@ -29,7 +29,7 @@ OTHERS: dict[str, tuple[str, ...]] = {
     "docs/lab/results.md": (),
     "README.md": (),
 }
-"""Numbers in the sentences of each page that are not results of learning, but settings, laws, speeds or task properties."""
+"""Numbers in the sentences of each page that are not results of learning, but settings, formulas, speeds or task properties."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,16 +57,16 @@ def plain(text: str) -> str:
 
 def differences(sentences: Sequence[Sentence]) -> Iterator[str]:
     """Yield sentences missing from their pages or unsupported by records, and decimal fractions in no registered sentence."""
-    pages = {*OTHERS, *(sentence.page for sentence in sentences)}
+    pages = {*OTHER_NUMBERS, *(sentence.page for sentence in sentences)}
     texts = {page: plain((CHECKOUT / page).read_text(encoding="utf-8")) for page in sorted(pages)}
     for sentence in sentences:
         if sentence.quote not in texts[sentence.page]:
             yield f"{sentence.page} does not say, as {sentence.record} does: {sentence.quote}"
         if not sentence.is_supported:
             yield f"{sentence.page}: {sentence.record} does not say: {sentence.quote}"
-    for page in OTHERS:
+    for page in OTHER_NUMBERS:
         text = texts[page]
-        quotes = [*(sentence.quote for sentence in sentences if sentence.page == page), *OTHERS[page], *_TESTS]
+        quotes = [*(sentence.quote for sentence in sentences if sentence.page == page), *OTHER_NUMBERS[page], *_TESTS]
         for quote in sorted(quotes, key=len, reverse=True):
             text = text.replace(quote, " ")
         text = re.sub(r"<!-- [\w ]+: begin.*?: end -->", " ", text)  # written from records

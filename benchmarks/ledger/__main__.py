@@ -31,7 +31,7 @@ def complaints(results: Path, checkout: Path) -> list[str]:
         lines += [str(stale) for stale in staleness.stale_records(results, checkout)]
     if (checkout / tables.PAGE).exists():
         lines += [f"{tables.PAGE}: {complaint}" for complaint in tables.missing_rows(results)]
-    return lines + list(pages.outdated(results, checkout))
+    return lines + list(pages.outdated_page_messages(results, checkout))
 
 
 def main(arguments: list[str] | None = None, checkout: Path = CHECKOUT) -> int:

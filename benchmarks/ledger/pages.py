@@ -110,7 +110,7 @@ def write_pages(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[
         yield page, after != before
 
 
-def outdated(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[str]:
+def outdated_page_messages(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[str]:
     """Yield a complaint for every page whose tables differ from the records or cannot be written; missing pages are skipped.
 
     Raises:

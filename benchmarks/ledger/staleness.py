@@ -154,12 +154,12 @@ def measured_files(name: str, env: str | None, on_cpu: bool, checkout: Path) -> 
         FileNotFoundError: A listed file does not exist.
     """
     for pattern in MEASURED[name]:
-        if "{task}" in pattern:
-            task = None if env is None else task_module(env)
-            if task is None:
-                continue
-            pattern = pattern.format(task=task)
-        path = checkout / pattern
+        task = None if env is None else task_module(env)
+        if "{task}" in pattern and task is None:
+            continue
+        path = checkout / pattern.format(task=task)
+        if path.suffix == ".xml" and not path.exists():
+            path = path.parent  # the task modifies models of others
         if not path.exists():
             raise FileNotFoundError(f"{path} is named in MEASURED of {Path(__file__).name}, and is not there")
         files = sorted(path.rglob("*")) if path.is_dir() else [path]

@@ -152,7 +152,7 @@ def train_brax(env: str, steps: int, seed: int) -> Measurement:
 def training_result(
     config: dict[str, Any], before: dict[str, float], after: dict[str, float], seconds: float, details: dict[str, Any]
 ) -> Measurement:
-    """Make the measurement of a training run from the figures of `evaluate`."""
+    """Make the measurement of a training run from the results of `evaluate`."""
     figures = {f"{name}_before": round(value, 4) for name, value in before.items()}
     figures |= {f"{name}_after": round(value, 4) for name, value in after.items()}
     return Measurement(

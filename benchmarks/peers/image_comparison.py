@@ -57,7 +57,7 @@ class Comparison:
     textured: np.ndarray
 
     @property
-    def labelled(self) -> bool:
+    def has_labels(self) -> bool:
         """True if labels are among the measured outputs."""
         return self.config["pixels"] == images.MESH_OUTPUTS[0]
 

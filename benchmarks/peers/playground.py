@@ -52,7 +52,7 @@ def measure_peer(ours: Measurement, control_period: float, repeats: int) -> Iter
     """Yield Playground's actions per second for each physics step.
 
     Args:
-        ours: Our figure, with the number of environments and the actions per call.
+        ours: Our measurement, with the number of environments and the actions per call.
         control_period: Simulated time per action, s.
         repeats: Maximum number of timed repeats.
     """

@@ -78,7 +78,7 @@ def measure(comparison: Comparison) -> Measurement:
         draw()
         wp.synchronize_device()
         # By world and camera; copies, because a CPU's arrays are views of buffers that the next image overwrites.
-        planes = (context.rgb_data, context.depth_data, *([context.seg_data] if comparison.labelled else []))
+        planes = (context.rgb_data, context.depth_data, *([context.seg_data] if comparison.has_labels else []))
         return [np.array(plane.numpy()).reshape(comparison.config["images"], size * size, -1) for plane in planes]
 
     assert_new_images(raw, draws)
@@ -187,7 +187,7 @@ def prepare(comparison: Comparison, options: dict[str, bool]) -> tuple[Any, list
         cam_res=(size, size),
         render_rgb=True,
         render_depth=True,
-        render_seg=comparison.labelled,
+        render_seg=comparison.has_labels,
         cam_active=list(range(comparison.cameras)),
         shadow_light_fraction=0.0,  # as in OpenGL and ours: nothing of a light reaches what lies in its shadow
         **options,

@@ -88,8 +88,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Measure the named tasks, or all; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", metavar="TASK")
-    parser.add_argument("--only", choices=("parity", "speed"), help="leave the other out")
-    parser.add_argument("--envs", type=int, help="environments of a speed (default: 1024, on a CPU 16)")
+    parser.add_argument("--only", choices=("parity", "speed"), help="measure this alone")
+    parser.add_argument("--envs", type=int, help="environments of a speed measurement (default: 1024, on a CPU 16)")
     parser.add_argument("--steps", type=int, help="steps per timed call (default: 50, on a CPU 10)")
     parser.add_argument("--repeats", type=int, default=5, help="maximum number of timed repeats; the median counts")
     parser.add_argument("--results", type=pathlib.Path, default=RESULTS, help="folder of stored records")

@@ -55,15 +55,15 @@ def count_kernels(events: list[tuple[float, float, str]]) -> tuple[collections.C
     return spent, launches
 
 
-def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: bool) -> None:
-    """Print the time of a call and of its kernels, and the slowest kernels, all divided by the number of ``turns`` in the call.
+def report(name: str, call: Callable[[], Any], repetitions: int, rows: int, in_order: bool) -> None:
+    """Print the time of a call and of its kernels, and the slowest kernels, all divided by the number of repetitions in a call.
 
     Args:
         name: Label of the first line.
         call: Function to time, which must wait for its results.
-        turns: Number of repetitions in a call, such as gradient steps.
+        repetitions: Number of repetitions in a call, such as gradient steps.
         rows: Number of kernels to list.
-        in_order: List the kernels of one turn as well, in their order.
+        in_order: List the kernels of one repetition as well, in their order.
     """
     call()
     seconds = []
@@ -74,13 +74,13 @@ def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: 
     events = trace_kernels(call)
     spent, launches = count_kernels(events)
     print(
-        f"{name}: {1e6 * min(seconds) / turns:.0f} us, of which {sum(spent.values()) / turns / 1e3:.0f} us in "
-        f"{sum(launches.values()) / turns:.0f} kernels"
+        f"{name}: {1e6 * min(seconds) / repetitions:.0f} us, of which {sum(spent.values()) / repetitions / 1e3:.0f} us in "
+        f"{sum(launches.values()) / repetitions:.0f} kernels"
     )
     for kernel, nanoseconds in spent.most_common(rows):
-        print(f"  {nanoseconds / turns / 1e3:10.1f} us  {launches[kernel] / turns:7.1f} x  {kernel[:90]}")
-    of_turn = len(events) // turns
-    of_one = events[turns // 2 * of_turn :][:of_turn]
+        print(f"  {nanoseconds / repetitions / 1e3:10.1f} us  {launches[kernel] / repetitions:7.1f} x  {kernel[:90]}")
+    per_repetition = len(events) // repetitions
+    of_one = events[repetitions // 2 * per_repetition :][:per_repetition]
     for at, duration, kernel in of_one if in_order else ():
         print(f"  at {(at - of_one[0][0]) / 1e3:8.1f} us for {duration / 1e3:7.1f} us  {kernel[:90]}")
     sys.stdout.flush()
@@ -118,11 +118,11 @@ def measure(program: TrainStep, options: argparse.Namespace) -> None:
 
     episodes = compiled["rollout"](*playing)[0] if "insert" in parts else None
     for part in parts:
-        _, _, turns, what = arguments[part]
+        _, _, repetitions, what = arguments[part]
         report(
             f"{what} of {program.config.run.seeds} learners",
             lambda part=part: run_phase(part),
-            turns,
+            repetitions,
             options.rows,
             options.in_order,
         )
@@ -154,7 +154,7 @@ def main() -> int:
         "--set", nargs="+", action="append", default=[], metavar=("FIELD", "VALUE"), help="a field of the configuration"
     )
     parser.add_argument("--rows", type=int, default=20, help="kernels to list of each part")
-    parser.add_argument("--in-order", action="store_true", help="list the kernels of one turn, too, in their order")
+    parser.add_argument("--in-order", action="store_true", help="list the kernels of one repetition, too, in their order")
     options = parser.parse_args()
     try:
         check_devices()

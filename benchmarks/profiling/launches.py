@@ -1,9 +1,9 @@
-"""Operations of a control step that a GPU would launch one after the other, counted without one.
+"""Operations of a control step that a GPU would launch one after the other, counted without a GPU.
 
     python -m benchmarks.profiling.launches [TASK ...] [--environments 64]
 
 A control step is compiled for a CPU with the MJX engine, one physics step after the other, and its operations are counted after
-fusion: those of a loop as often as it turns. A GPU fuses some differently, but each of the rest is a launch, however little it
+fusion, those of a loop once per iteration. A GPU fuses some differently, but each of the rest is a launch, however little it
 computes. Where the scalar engine has a kernel for the task (`physics.scalar`), all physics steps become one launch, and only
 the operations outside of the loop over them remain.
 """
@@ -25,17 +25,18 @@ _NO_LAUNCH = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast", 
 _COMPUTATION = re.compile(r"^(ENTRY )?%?([\w.-]+) .*\{$")
 _INSTRUCTION = re.compile(r"^\s+(?:ROOT )?%?[\w.-]+ = (?:\([^=]*?\)|\S+) ([\w-]+)\(")
 _CALLED = re.compile(r"(?:body|to_apply)=%?([\w.-]+)")
-_TURNS = re.compile(r'"known_trip_count":\{"n":"(\d+)"')
+_TRIP_COUNT = re.compile(r'"known_trip_count":\{"n":"(\d+)"')
 
 Counts = collections.Counter[str]
 
 
 def count_launches(program: str) -> tuple[Counts, Counts, int]:
-    """Count the operations of an optimized HLO program by kind.
+    """Count the operations of an optimized HLO program by opcode.
 
     Returns:
-        Operations outside of the loop with the most operations, those of one turn of that loop, and its turns. Operations of
-        other loops count as often as these turn; loops whose turns depend on data count as one turn and as "open loop".
+        Operations outside the loop with the most operations, operations of one iteration of that loop, and its number of
+        iterations. Operations in other loops are multiplied by their trip counts; each iteration also counts as one "loop
+        iteration". A loop whose trip count depends on data counts as one iteration, called "open loop".
     """
     computations: dict[str, list[str]] = {}
     entry = name = ""
@@ -55,8 +56,8 @@ def count_launches(program: str) -> tuple[Counts, Counts, int]:
             (kind,) = _INSTRUCTION.match(line).groups()  # type: ignore[union-attr] - matched above
             called = _CALLED.search(line)
             if kind == "while" and called:
-                turns = _TURNS.search(line)
-                inside, times = count(called[1]), int(turns[1]) if turns else 1
+                trip_count = _TRIP_COUNT.search(line)
+                inside, times = count(called[1]), int(trip_count[1]) if trip_count else 1
                 if is_entry and inside.total() * times > longest[0].total() * longest[1]:
                     for part, number in longest[0].items():
                         total[part] += number * longest[1]
@@ -64,7 +65,7 @@ def count_launches(program: str) -> tuple[Counts, Counts, int]:
                 else:
                     for part, number in inside.items():
                         total[part] += number * times
-                total["open loop" if turns is None else "turn of a loop"] += times
+                total["open loop" if trip_count is None else "loop iteration"] += times
             elif kind == "call" and called:
                 total += count(called[1], is_entry)
             elif kind not in _NO_LAUNCH:
@@ -94,10 +95,10 @@ def main() -> int:
         print("this counts a program for a CPU: set JAX_PLATFORMS=cpu", file=sys.stderr)
         return 2
     for name in options.tasks:
-        outside, inside, turns = count_launches(control_step(name, options.environments))
+        outside, inside, iterations = count_launches(control_step(name, options.environments))
         has_kernel = scalar.supports(jaxrl_vis_envs.make(name)._model)
-        print(f"{name}: {outside.total() + turns * inside.total():,} operations a control step, one by one")
-        print(f"  {turns} turns of {inside.total():,}: {dict(inside.most_common())}")
+        print(f"{name}: {outside.total() + iterations * inside.total():,} operations a control step, one by one")
+        print(f"  {iterations} iterations of {inside.total():,}: {dict(inside.most_common())}")
         print(f"  {outside.total():,} others: {dict(outside.most_common())}")
         print(f"  with all physics steps in one kernel: {outside.total() + 1:,}" if has_kernel else "  no kernel", flush=True)
     return 0

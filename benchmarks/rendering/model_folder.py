@@ -4,8 +4,8 @@ Each MJCF or URDF file is rendered in its initial and in a random pose: by its c
 of its own cameras. Sites and haze have rows of their own, if the model has them. If a camera or a light moves, the poses come
 from `mjx.kinematics`, as in a task. Shadows, reflections, skins, flexes and multisampling are off.
 
-The pass criterion is in `Measures.failures`. Models that do not load, that are hardly visible, or of which MuJoCo's own image
-is unreliable have verdicts of their own, which do not count as failures.
+The pass criterion is in `Measures.failures`. Models that do not load, that are hardly visible, or whose image by MuJoCo is
+unreliable have verdicts of their own, which do not count as failures.
 """
 
 import dataclasses

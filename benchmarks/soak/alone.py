@@ -209,7 +209,7 @@ def _grasp_arguments(folder: Path, spec: Path) -> list[str]:
     return [*words, "--workers", "2", "--json", str(folder / "eval.json")]
 
 
-def _figures(file: Path) -> list[dict[str, Any]]:
+def _run_results(file: Path) -> list[dict[str, Any]]:
     """Read the results of each run, without durations."""
     runs = json.loads(file.read_text())["each"]
     for record in runs:
@@ -218,11 +218,11 @@ def _figures(file: Path) -> list[dict[str, Any]]:
 
 
 def worker_of_grasping(folder: Path, rng: random.Random, references: "References") -> None:
-    """Kill a worker of ``grasp eval``; the next start gives the same figures."""
-    spec, figures = references.grasping()
+    """Kill a worker of ``grasp eval``; the next start gives the same results."""
+    spec, expected = references.grasping()
     _check_pool(_grasp_arguments(folder, spec), folder, rng)
-    if _figures(folder / "eval.json") != figures:
-        raise Broken("figures differ from those of an undisturbed evaluation")
+    if _run_results(folder / "eval.json") != expected:
+        raise Broken("results differ from those of an undisturbed evaluation")
 
 
 class NotStruck(Exception):
@@ -294,7 +294,7 @@ class References:
             spec = folder / "few.json"
             spec.write_text(json.dumps(FEW_TO_GRASP))
             _wait_until_finished(_start_command(_grasp_arguments(folder, spec), folder), 0)
-            return spec, _figures(folder / "eval.json")
+            return spec, _run_results(folder / "eval.json")
 
         return self._compute_once("grasping", make)
 
@@ -324,7 +324,7 @@ SEPARATE_FAULTS: dict[str, SeparateFault] = {
     "killed worker of phenotype run": SeparateFault(
         worker_of_phenotyping, "one-line message; a restart yields the tables of an undisturbed run"
     ),
-    "killed worker of grasp eval": SeparateFault(worker_of_grasping, "one-line message; a restart yields undisturbed figures"),
+    "killed worker of grasp eval": SeparateFault(worker_of_grasping, "one-line message; a restart yields undisturbed results"),
 }
 
 

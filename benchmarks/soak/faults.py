@@ -269,7 +269,7 @@ def _bit_in_metrics(folder: Path, rng: random.Random) -> int | None:
 
 
 def _move_folder(is_kept: bool) -> Strike:
-    """Return a strike that moves the folder, and back after the process has ended; or that deletes it."""
+    """Return a strike that moves the folder away, and back after the process has ended; or one that deletes it."""
 
     def strike(folder: Path, rng: random.Random) -> int | None:
         there = folder.with_name(f"{folder.name}-{'moved' if is_kept else 'trash'}")
@@ -296,7 +296,7 @@ def _move_folder(is_kept: bool) -> Strike:
 
 
 def _stale_lock(folder: Path, rng: random.Random) -> int | None:
-    """Leave the lock of a dead process. Without file locks a lease must expire, which takes a minute: rarely tried."""
+    """Leave the lock of a dead process. Rarely without file locks, where its lease must expire, which takes a minute."""
     no_locks = rng.random() < 0.15
     variables = _with_site(SOAK_NO_LOCKS="1") if no_locks else _with_site()
     with kill_on_exit(_start_run(folder, rng, variables)) as process:

@@ -164,7 +164,7 @@ class RunProcess:
         return self.popen.poll() is None
 
     def wait_for(self, condition: Callable[[], bool], seconds: float = 180.0) -> bool:
-        """Wait for a condition, at most ``seconds`` and until the process ends; return True if it holds."""
+        """Wait until a condition holds, ``seconds`` have passed or the process ends; return True if the condition holds."""
         deadline = time.monotonic() + seconds
         while self.is_running() and time.monotonic() < deadline:
             if condition():

@@ -67,7 +67,7 @@ class Soak:
             return deck.pop()
 
     def _return_fault(self, faults: dict[str, Any], fault: str) -> None:
-        """Return a fault to the deck, because the run had finished before it."""
+        """Put a fault back into the deck, because the run had finished before it."""
         with self._lock:
             self._left += 1
             self._decks[next(iter(faults))].insert(0, fault)
@@ -117,7 +117,7 @@ class Soak:
 
     def _strike_run(self, folder: Path, rng: random.Random, faults: list[str]) -> bool:
         """Train one run to its end, with faults; return False if none is left for it."""
-        spoilt, fault = False, None
+        may_have_lost_rows, fault = False, None
         while len(faults) < FAULTS_PER_RUN:
             fault = self._next_fault(FAULTS)
             if fault is None:
@@ -130,7 +130,7 @@ class Soak:
                 break
             if status not in FAULTS[fault].statuses:
                 raise Broken(f"status {status}: {LAST_OUTPUT.lines[-4:]}")
-            spoilt |= FAULTS[fault].may_lose_rows
+            may_have_lost_rows |= FAULTS[fault].may_lose_rows
             if folder.exists() and not (FAULTS[fault].may_lose_rows or FAULTS[fault].goes_back):
                 self._check_nothing_lost(folder, before, good[-1][0] if good else 0)
             self._note_fault(folder.name, fault, f"status {status}")
@@ -141,7 +141,7 @@ class Soak:
             if (status := process.wait()) != 0:
                 raise Broken(f"it did not finish: status {status}, {process.lines[-5:]}")
             process.check_output()
-        self._check_end(folder, spoilt)
+        self._check_end(folder, may_have_lost_rows)
         return True
 
     def _check_nothing_lost(self, folder: Path, before: list[dict[str, Any]], checkpointed: int) -> None:
@@ -163,13 +163,13 @@ class Soak:
         if newest < checkpointed - 1:
             raise Broken(f"the newest checkpoint was of iteration {checkpointed}, and is of {newest}")
 
-    def _check_end(self, folder: Path, spoilt: bool) -> None:
+    def _check_end(self, folder: Path, may_have_lost_rows: bool) -> None:
         rows = read_rows(folder)
         total = account(read_processes(folder / "processes.jsonl"), self.reference[-1]["iteration"])
-        if not spoilt and [row["iteration"] for row in rows] != [row["iteration"] for row in self.reference]:
+        if not may_have_lost_rows and [row["iteration"] for row in rows] != [row["iteration"] for row in self.reference]:
             raise Broken(f"rows {[row['iteration'] for row in rows]}")
         exact = rows == self.reference
-        if not exact and not spoilt and not total.replays_lost:
+        if not exact and not may_have_lost_rows and not total.replays_lost:
             raise Broken("metrics.jsonl differs from the undisturbed run's, though no replay was lost")
         if total.begun is None:
             raise Broken("processes.jsonl is damaged")

@@ -1,7 +1,7 @@
 """Fit the gate of a weights file, and measure it: `python -m benchmarks.stalks.gate FOLDER --weights WEIGHTS`.
 
 Images of several families are rendered into FOLDER unless they exist. The gate and its threshold are fitted on the images of
-the first seeds, and written beside the weights; the printed figures come from other seeds. A control uses only mean brightness
+the first seeds, and written beside the weights; the printed metrics come from other seeds. A control uses only mean brightness
 and sharpness of an image. Real images are never fitted on: `--photographs MODULE:FUNCTION` names a function that yields (image,
 number of stalks, function from boxes [N, 4] to the number of stalks that they detect), and these are only evaluated.
 """
@@ -221,7 +221,7 @@ def _render_task(folder: Path, tasks: list[tuple[str, str, int]], index: int) ->
 
 
 def main() -> None:
-    """Render the images, fit the gate, write it beside the weights, and print its figures on the images for testing."""
+    """Render the images, fit the gate, write it beside the weights, and print its metrics on the images for testing."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--weights", type=Path, default=SHIPPED)

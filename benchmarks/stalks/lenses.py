@@ -1,7 +1,7 @@
 """Counts and widths of one synthetic row through lenses of other focal lengths: `python -m benchmarks.stalks.lenses FOLDER`.
 
 The pairs of each lens are rendered into FOLDER unless they exist, which takes minutes on a GPU and much longer without. Nothing
-is refused here: the limits of `phenotype run` follow from this table. With `--results benchmarks/results` the figures go into
+is refused here: the limits of `phenotype run` follow from this table. With `--results benchmarks/results` the results go into
 the record that docs/phenotyping.md quotes, replacing the earlier ones of the same lens.
 """
 

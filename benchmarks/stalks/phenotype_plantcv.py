@@ -150,7 +150,7 @@ def _print(name: str, theirs: np.ndarray, ours: np.ndarray, truth: np.ndarray) -
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Widths of the same masks by PlantCV and by ours.")
     parser.add_argument("file", type=Path, help="of masks, .npz; written with --plots, read without")
-    parser.add_argument("--plots", type=int, default=0, help="draw so many, and keep their masks")
+    parser.add_argument("--plots", type=int, default=0, help="number of plots to render, whose masks are kept")
     parser.add_argument("--seed", type=int, default=0, help="of the first plot")
     parser.add_argument("--family", default="shifted", choices=("training", "shifted"))
     parser.add_argument("--workers", type=int, default=1, help="processes that draw plots side by side")

@@ -1,7 +1,7 @@
 """Behaviour cloning with relabelled goals as a custom algorithm: ``--algorithm benchmarks.tasks.behaviour_cloning:make``.
 
-The actor of the shared networks imitates the action taken on the way to a goal that the episode reached later: the simplest
-offline learner, in one file with the interface of the built-in algorithms.
+The actor of the built-in networks (`Networks`) imitates the action taken on the way to a goal that the episode reached later:
+the simplest offline learner, in one file with the interface of the built-in algorithms.
 """
 
 from typing import Any, NamedTuple

@@ -119,7 +119,7 @@ def report(name: str, count: int, size: int) -> bool:
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the results of each task; return 1 if one fails, else 0."""
-    parser = argparse.ArgumentParser(description="Whether goal images show and tell apart what matters.")
+    parser = argparse.ArgumentParser(description="Visible parts of goal images, and distinct goals with identical ones.")
     parser.add_argument("env", nargs="*", default=sorted(PARTS), help=f"any of {', '.join(sorted(PARTS))}; default: all")
     parser.add_argument("--goals", type=int, default=1000)
     parser.add_argument("--image-size", type=int, default=100)

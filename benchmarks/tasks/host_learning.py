@@ -43,7 +43,7 @@ _SMALL: dict[str, Any] = {
 _SEEDS, _NOISES, _EVALUATION_SEED, _BEHAVIOUR_SEED = (100, 101, 102), (2, 5), 10_000, 20_000
 TARGET_SUCCESS, IN_A_ROW = 0.9, 3
 _LATEST = 20
-"""Number of the last updates' metrics that a record averages."""
+"""Number of final rows of metrics averaged for a record; each row is the mean over one call of `Learner.update`."""
 
 
 @dataclasses.dataclass(frozen=True)

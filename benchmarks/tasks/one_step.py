@@ -74,7 +74,7 @@ def visited_states(
 
 
 def fetch_states(env: Any) -> VisitedStates:
-    """Visit states with half of the targets in the air, and half that press the fingers onto the table."""
+    """Return visited states, with half of the targets in the air, and half that press the fingers onto the table."""
     start, rng = env.sample_start(jax.random.key(0)), np.random.default_rng(0)
     targets = np.asarray(start.xpos[env.mj_model.body("gripper").id]) + rng.uniform(-0.15, 0.15, (24, 10, 3))
     targets[12:, :, 2] -= 0.15
@@ -83,7 +83,7 @@ def fetch_states(env: Any) -> VisitedStates:
 
 
 def push_states(env: Any) -> VisitedStates:
-    """Visit states with the gripper starting beside a face of the box, which it pushes or misses."""
+    """Return visited states, with the gripper starting beside a face of the box, which it pushes or misses."""
     rng = np.random.default_rng(0)
     start = env.sample_start(jax.random.key(0))
     gripper, grip = np.asarray(start.xpos[env.mj_model.body("gripper").id]), np.asarray(start.site_xpos[0])
@@ -98,14 +98,14 @@ def push_states(env: Any) -> VisitedStates:
 
 
 def finger_states(env: Any) -> VisitedStates:
-    """Visit states under random torques from 24 initial states."""
+    """Return visited states under random torques from 24 initial states."""
     starts = environments.reset(env, jax.random.split(jax.random.key(3), 24))[0].data.qpos
     held = np.repeat(np.random.default_rng(0).uniform(-1, 1, (24, 10, 2)), 5, axis=1)
     return visited_states(env.mj_model, np.asarray(starts, np.float64), held, every=7)
 
 
 def hand_states(env: Any) -> VisitedStates:
-    """Visit states with every joint driven to a random end of its range."""
+    """Return visited states, with every joint driven to a random end of its range."""
     low, high = env.mj_model.actuator_ctrlrange.T
     controls = low + (high - low) * np.random.default_rng(0).integers(0, 2, (8, 12, 20))
     start = np.asarray(env.sample_start(jax.random.key(0)).qpos, np.float64)
@@ -113,7 +113,7 @@ def hand_states(env: Any) -> VisitedStates:
 
 
 def reacher_states(env: Any) -> VisitedStates:
-    """Visit states with half of the starts near the elbow's limit, the only constraint, on either side of it."""
+    """Return visited states, with half of the starts near the elbow's limit, the only constraint, on either side of it."""
     rng = np.random.default_rng(0)
     near_limit = rng.choice([-1.0, 1.0], 32) * rng.uniform(2.9, 3.1, 32)
     starts = np.stack([rng.uniform(-6, 6, 64), np.concatenate([rng.uniform(-3, 3, 32), near_limit])], axis=1)
@@ -121,7 +121,7 @@ def reacher_states(env: Any) -> VisitedStates:
 
 
 def sawyer_states(env: Any) -> VisitedStates:
-    """Visit states with targets distributed over the goal box."""
+    """Return visited states, with targets distributed over the goal box."""
     rng = np.random.default_rng(0)
     targets = np.array(env.config.goal_centre) + np.array(env.config.goal_size) * rng.uniform(-0.5, 0.5, (12, 10, 3))
     starts = np.tile(np.asarray(env.sample_start(jax.random.key(0)).qpos, np.float64), (12, 1))

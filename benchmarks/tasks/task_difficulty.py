@@ -1,4 +1,4 @@
-"""Difficulty of the tasks before learning: the figures of `jaxrl-vis envs`.
+"""Difficulty of the tasks before learning, as listed by `jaxrl-vis envs`.
 
     python -m benchmarks.tasks.task_difficulty [ENV ...] [--episodes 1000]
 

@@ -68,7 +68,7 @@ def image_sizes(settings: Settings) -> tuple[int, ...]:
 
 
 def random_states(settings: Settings, count: int, seed: int = 4) -> Any:
-    """Create states of ``count`` environments after five random control steps, without images; ``seed`` is of the actions."""
+    """Create states of ``count`` environments after five random control steps, without images; ``seed`` selects the actions."""
     env = settings.make_env()
 
     def scatter(state: Any, key: jax.Array) -> Any:

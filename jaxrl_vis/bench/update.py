@@ -33,7 +33,7 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
 def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
     """Fill a replay with noise: no two frames are equal, and every part of the replay is read.
 
-    Episodes are filled one at a time: random words for a whole replay of images would need several times the memory.
+    Episodes are filled one at a time: random bits for a whole replay of images would need several times the memory.
     """
 
     def noise(leaf: jax.Array, leaf_key: jax.Array) -> jax.Array:

@@ -165,25 +165,25 @@ def split_command(argv: Sequence[str]) -> tuple[str, Sequence[str]]:
     Raises:
         RequestError: There is no such command.
     """
-    table = COMMANDS if argv[0] in COMMANDS else all_commands()
+    names = COMMANDS if argv[0] in COMMANDS else all_commands()
     for count in range(len(argv), 0, -1):
         name = " ".join(argv[:count])
-        if name in table:
+        if name in names:
             return name, argv[count:]
     group = ""
     for word in argv:
-        choices = _next_words(group, table)
+        choices = _next_words(group, names)
         if word not in choices:
             kind = "option" if word.startswith("-") and not group else "command"
             raise RequestError(f"unknown {kind} {group + word!r}{nearest(word, choices)}")
         group += f"{word} "
     name = group.strip()
-    raise RequestError(f"{name} what? Choose one of {', '.join(_next_words(group, table))} (or see {PROGRAM} {name} --help)")
+    raise RequestError(f"{name} what? Choose one of {', '.join(_next_words(group, names))} (or see {PROGRAM} {name} --help)")
 
 
-def _next_words(group: str, table: Iterable[str]) -> list[str]:
+def _next_words(group: str, names: Iterable[str]) -> list[str]:
     """List the words that may follow ``group``, which ends in a space unless it is empty, in names of commands."""
-    return list(dict.fromkeys(name.removeprefix(group).split()[0] for name in table if name.startswith(group)))
+    return list(dict.fromkeys(name.removeprefix(group).split()[0] for name in names if name.startswith(group)))
 
 
 def _parse_command(argv: Sequence[str]) -> Callable[[], int]:

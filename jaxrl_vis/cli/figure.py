@@ -134,8 +134,8 @@ def _request(options: Figure, out: Path) -> "Request":
     if not options.draw_only:
         check_writable(runs, "--runs", folder=True)
     elif not runs.is_dir():
-        raise RequestError(f"--runs {runs} is no folder, and --draw-only draws trained runs: name their folder")
-    quick = dict(study.family.quick) if options.quick else {}
+        raise RequestError(f"--runs {runs} is not a folder, and --draw-only draws trained runs: name their folder")
+    quick = dict(study.family.quick_changes) if options.quick else {}
     if options.env_steps is not None:
         quick.pop("env_steps", None)
     scope = Scope(

@@ -82,20 +82,20 @@ class _Option:
     Attributes:
         name: Name of the field.
         hint: Its annotation, without extras.
-        positional: True for a positional argument.
+        is_positional: True for a positional argument.
         help: One or more sentences.
         default: Description of its default in the help; empty if obvious.
-        required: True if it must be given.
+        is_required: True if it must be given.
         changes: Field of the command that collects it; None if it is a field of the command itself.
         is_positional_form: True for the positional form of a field that is also an option.
     """
 
     name: str
     hint: Any
-    positional: bool
+    is_positional: bool
     help: str
     default: str
-    required: bool
+    is_required: bool
     changes: str | None = None
     is_positional_form: bool = False
 
@@ -115,9 +115,9 @@ class _Option:
         one, optional, several = fields.unwrap(self.hint)
         choices = fields.choices(self.hint)
         word = f"{{{','.join(choices)}}}" if choices else "TEXT" if one is str else one.__name__.upper()
-        if self.positional:
+        if self.is_positional:
             word = word if choices else self.name.upper()
-            return f"[{word} ...]" if several else word if self.required else f"[{word}]"
+            return f"[{word} ...]" if several else word if self.is_required else f"[{word}]"
         # None is shown only where it can override a preset or a saved run.
         return f"[{word} ...]" if several else f"{word}|None" if optional and self.changes else word
 
@@ -147,7 +147,7 @@ class _Option:
             str_from_instance=lambda _: [],
         )
         extras = [words, tyro.conf.arg(help=self.help, help_behavior_hint=hint, metavar=self.metavar)]
-        if self.positional:
+        if self.is_positional:
             extras.append(tyro.conf.Positional)
         return Annotated[list[str], *extras]
 
@@ -174,7 +174,7 @@ def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
         word = left_over[0].partition("=")[0].replace("_", "-") if left_over[0].startswith("-") else left_over[0]
         if not word.startswith("-"):
             raise RequestError(f"unexpected argument {word!r}; see {program} --help")
-        flags = [option.flag for option in options.values() if not option.positional]
+        flags = [option.flag for option in options.values() if not option.is_positional]
         if word == "--version":
             raise RequestError(f"--version goes without a command: {PROGRAM} --version")
         if word in _FOREIGN_OPTIONS and word not in flags:
@@ -192,7 +192,7 @@ def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
                 both = f"{' '.join(map(str, first))} by {option.flag} and {' '.join(map(str, second))} by position"
                 raise RequestError(f"{option.name} is given twice, {both}; give it once")
             target[option.name] = value
-        elif option.required and option.name not in values:
+        elif option.is_required and option.name not in values:
             choices = fields.choices(option.hint)
             hint = f"; choose one of {', '.join(choices)}" if choices else f": {option.help} See {program} --help"
             raise RequestError(f"no {option.name if choices else option.metavar} given{hint}")
@@ -230,8 +230,8 @@ def _check_values(words: Sequence[str], options: Sequence[_Option]) -> None:
     Raises:
         RequestError: There are such values.
     """
-    flags = {option.flag: option for option in options if not option.positional}
-    takes_path = any(option.positional and option.hint is Path for option in options)
+    flags = {option.flag: option for option in options if not option.is_positional}
+    takes_path = any(option.is_positional and option.hint is Path for option in options)
     for index, word in enumerate(words):
         option = flags.get(word.replace("_", "-"))
         following = list(itertools.takewhile(_is_number, words[index + 1 :]))
@@ -257,9 +257,9 @@ def _value(option: _Option, words: Any) -> Any:
         return words
     words = [words] if isinstance(words, str) else words
     choices = fields.choices(option.hint)
-    if option.positional and choices and words[0] not in choices:
+    if option.is_positional and choices and words[0] not in choices:
         raise RequestError(f"unknown {option.name} {words[0]!r}{nearest(words[0], choices)}")
-    return fields.read(option.name if option.positional else option.flag, option.hint, words)
+    return fields.read(option.name if option.is_positional else option.flag, option.hint, words)
 
 
 def _collect_options(command: type) -> list[_Option]:
@@ -272,16 +272,16 @@ def _collect_options(command: type) -> list[_Option]:
     for field, text in describe_options(command):
         changes = next((extra for extra in field.extras if isinstance(extra, FieldsOf)), None)
         if changes is None:
-            required = field.default is dataclasses.MISSING
-            default = "required" if required else f"default: {field.default}" if field.default else ""
+            is_required = field.default is dataclasses.MISSING
+            default = "required" if is_required else f"default: {field.default}" if field.default else ""
             for extra in field.extras:
                 default = extra.describe() if isinstance(extra, DefaultText) else default
             if AlsoPositional() in field.extras:
-                options.append(_Option(field.name, field.hint, False, text, "" if required else default, False))
-                options.append(_Option(field.name, field.hint, True, text, default, required, is_positional_form=True))
+                options.append(_Option(field.name, field.hint, False, text, "" if is_required else default, False))
+                options.append(_Option(field.name, field.hint, True, text, default, is_required, is_positional_form=True))
                 continue
-            positional = tyro.conf.Positional in field.extras
-            options.append(_Option(field.name, field.hint, positional, text, default, required))
+            is_positional = tyro.conf.Positional in field.extras
+            options.append(_Option(field.name, field.hint, is_positional, text, default, is_required))
             continue
         options += [
             _Option(item.name, item.hint, False, item_text, changes.default(item.name), False, field.name)

@@ -36,11 +36,6 @@ class Method:
     balance_probability: float = 0.0
 
     @property
-    def balance(self) -> bool:
-        """True if samples are balanced: some use the next observation as their goal, which is a certain positive."""
-        return self.balance_probability > 0.0
-
-    @property
     def needs_images(self) -> bool:
         """True if rewards are computed from images, so that the environment must provide them."""
         return self.is_learned or self.reward == "features"

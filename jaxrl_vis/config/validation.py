@@ -119,7 +119,8 @@ def _validate_reward(config: Config) -> None:
             raise RequestError(f"{option} needs true states, which method {name} does not use: choose --method oracle")
     if _is_changed(config, "trivial_goals") and kind not in ("oracle", "indicator", "indicator_tolerance"):
         raise RequestError(
-            f"trivial_goals needs the oracle or an indicator, to tell what is reached, not method {name}: leave it out"
+            "trivial_goals needs the oracle or an indicator, to determine which goals are reached, "
+            f"not method {name}: leave it out"
         )
     false_rewards = {option: config.value(option) for option in marked(FALSE_REWARD)}
     for option, value in {**false_rewards, "reward_noise": study.reward_noise}.items():

@@ -49,11 +49,11 @@ class Training:
     """Smoke test: a complete training run of the smallest preset with images.
 
     Attributes:
-        figures: Results of the last run: ``task``, ``env_steps``, ``env_steps_per_s`` (without compilation) and ``wall_s``;
+        results: Results of the last run: ``task``, ``env_steps``, ``env_steps_per_s`` (without compilation) and ``wall_s``;
             None before it.
     """
 
-    figures: dict[str, Any] | None = None
+    results: dict[str, Any] | None = None
 
     def __call__(self) -> str:
         """Train, and return a line for the report; the trainer raises an error if a number is not finite."""
@@ -66,7 +66,7 @@ class Training:
                 pass
             row = run.rows()[-1]
         speed, done, wall = float(row["time/env_steps_per_s"]), int(row["env_steps"]), time.perf_counter() - start
-        self.figures = {
+        self.results = {
             "task": _TASK,
             "env_steps": done,
             "env_steps_per_s": round(speed, 1),
@@ -91,7 +91,7 @@ def report(path: Path) -> int:
     status = doctor.main([("training", training)], findings)
     if status == 2:
         return status
-    record = to_record(findings, training.figures)
+    record = to_record(findings, training.results)
     file = path / f"{file_name(record)}.json" if path.is_dir() else path
     try:
         write_atomically(file, json.dumps(record, indent=1) + "\n")
@@ -102,11 +102,11 @@ def report(path: Path) -> int:
 
 
 def to_record(findings: dict[str, Any], training: dict[str, Any] | None) -> dict[str, Any]:
-    """Record what ran on this machine.
+    """Return the record of what ran on this machine.
 
     Args:
         findings: From `doctor.main`.
-        training: `Training.figures`; None if it failed.
+        training: `Training.results`; None if it failed.
     """
     device = provenance.device_record()
     return {

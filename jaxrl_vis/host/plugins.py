@@ -78,8 +78,9 @@ def build_component(kind: str, name: str, maker: Any, *arguments: Any, expected_
     """
     if isinstance(maker, expected_type):
         return maker
+    problem = f"{name} is not {'an' if kind[0] in 'aeiou' else 'a'} {kind}"
     if not callable(maker):
-        raise RequestError(f"{name} is no {kind}: it must be a function that returns a {expected_type.__name__}, not {maker!r}")
+        raise RequestError(f"{problem}: it must be a function that returns a {expected_type.__name__}, not {maker!r}")
     try:
         made = maker(*arguments)
     except RequestError:
@@ -88,5 +89,5 @@ def build_component(kind: str, name: str, maker: Any, *arguments: Any, expected_
         file = getattr(getattr(maker, "__code__", None), "co_filename", None)
         raise RequestError(f"{kind} {name} cannot be made: {task_modules.describe_error(error, file)}") from error
     if not isinstance(made, expected_type):
-        raise RequestError(f"{name} is no {kind}: it returned a {type(made).__name__}, not a {expected_type.__name__}")
+        raise RequestError(f"{problem}: it returned a {type(made).__name__}, not a {expected_type.__name__}")
     return made

@@ -170,7 +170,7 @@ def read_about(path: Path, command: str) -> dict[str, Any]:
         with safetensors.safe_open(path, framework="numpy") as file:
             about = parse_json((file.metadata() or {})[_ABOUT])
         if not isinstance(about, dict):
-            raise ValueError(f"{_ABOUT} is no table")
+            raise ValueError(f"{_ABOUT} is not a JSON object")
         return about
     except OSError as error:
         raise RequestError(f"cannot read the weights {path}: {error.strerror or error}") from error

@@ -9,7 +9,7 @@
 
 An algorithm is built by a function of a `Setup`, which holds the configuration and the sizes of the task. DDPG, TD3 and
 contrastive RL are built in (`train_step.ALGORITHMS`); ``--algorithm module:Name`` selects a custom one. `networks.policy`
-provides ``act``, ``encode_goal`` and ``policy_params`` for algorithms whose actor is that of the shared networks.
+provides ``act``, ``encode_goal`` and ``policy_params`` for algorithms with an actor of `Networks`.
 """
 
 import dataclasses

@@ -210,7 +210,7 @@ def _full_state_size(env: GoalEnv, config: Config) -> int:
         raise RequestError(f"critic_states is for images, and {name} observes states: leave it out")
     observe_state = getattr(env, "observe_state", None)
     if observe_state is None:
-        raise RequestError(f"critic_states needs a task with observe_state, which {name} has not: leave it out")
+        raise RequestError(f"critic_states needs a task with observe_state, which {name} does not have: leave it out")
     return jax.eval_shape(lambda: observe_state(env.reset(jax.random.key(0)).data)).shape[0]
 
 

@@ -55,7 +55,7 @@ def read(path: Path) -> Recordings:
         if missing:
             raise ValueError(f"it holds no {' and no '.join(missing)}")
         if not isinstance(about, dict):
-            raise ValueError(f"{_ABOUT} is no table")
+            raise ValueError(f"{_ABOUT} is not a JSON object")
         for name, array in arrays.items():
             if np.issubdtype(array.dtype, np.floating):
                 arrays[name] = array.astype(np.float32)

@@ -1,6 +1,6 @@
 """Colour maps for depth and geom ids, in videos and in the gallery.
 
-Matplotlib is imported lazily: a run imports this module before it knows whether it will draw.
+Matplotlib is imported lazily: a run imports this module even if it draws nothing.
 """
 
 import numpy as np

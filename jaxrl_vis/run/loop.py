@@ -355,7 +355,7 @@ class RunLoop:
         return Report(iteration, iteration * env_steps, iteration * updates, values)
 
     def _read(self) -> Report:
-        """Wait for the metrics of the oldest unread iteration, and record them.
+        """Wait for the metrics of the oldest unread iteration, record them, and return their report.
 
         Raises:
             NonFiniteError: A guard metric is not 0.
@@ -379,7 +379,7 @@ class RunLoop:
         return self._programs.pending(outcome)
 
     def _evaluate(self, report: Report, outcome: PendingMetrics) -> Report:
-        """Read the results of an evaluation, write a line per seed, and add the figures to the report."""
+        """Read the results of an evaluation, write a line per seed, and add the metrics to the report."""
         progress, speed = self._progress, self._pace.speed(self._done)
         values = outcome.read_per_seed(self._config.run.seeds)
         if not all(np.isfinite(row).all() for row in values.values()):
@@ -403,7 +403,7 @@ class RunLoop:
                 rows = [row for row in rows if row["seed"] not in self._evaluated_seeds]
             with self._saver.writing():
                 metrics.append_rows(self._folder.metrics, rows)
-            self._loggers.rows(rows)
+            self._loggers.log_rows(rows)
         progress.evaluation_due = False
         self._warn_if_filtered(means)
         # The last evaluation may lie between two scheduled ones; a longer run, resumed from here, continues the means.
@@ -432,7 +432,7 @@ class RunLoop:
         self._progress.filtered = self._progress.filtered + 1 if too_much else 0
         if self._progress.filtered == _FILTERED_EVALUATIONS:
             self._echo(
-                f"warning: more than {_FILTERED_TOO_MUCH:.0%} of the negatives were filtered since "
+                f"warning: more than {_FILTERED_TOO_MUCH:.0%} of the negatives were filtered in the last "
                 f"{_FILTERED_EVALUATIONS} evaluations: Q lies above q0 almost everywhere and cannot come down; "
                 "check reward_positive, reward_negative and filter_threshold"
             )

@@ -103,7 +103,7 @@ def check_missing_rows(folder: RunFolder, restored: Restored) -> None:
 def truncate_metrics(
     folder: RunFolder, checkpoints: Checkpoints, last: int, keeps_later: bool = False, evaluated: int = 0
 ) -> str | None:
-    """Truncate metrics.jsonl to the run's rows up to iteration ``last``; further arguments and result as `metrics.truncate`."""
+    """Truncate metrics.jsonl to the run's rows up to iteration ``last``; other arguments as for `metrics.truncate`."""
     return metrics.truncate(folder.metrics, last, checkpoints.run_id, *_asides(folder), keeps_later, evaluated)
 
 

@@ -115,7 +115,7 @@ class Saver:
         """Save the state for resuming after a kill; see `jaxrl_vis.run.storage.recent`.
 
         Raises:
-            NonFiniteError, StorageError: As `save_light`.
+            NonFiniteError, StorageError: As in `save_light`.
         """
         started = time.monotonic()
         self._check()
@@ -141,7 +141,7 @@ class Saver:
         message.
 
         Raises:
-            NonFiniteError, StorageError: As `save_light`.
+            NonFiniteError, StorageError: As in `save_light`.
         """
         hint = f"{interruption.quit_hint} at once, without the replay"
         self._echo(f"{interruption.name}: saving iteration {iteration} ({hint}) ...")

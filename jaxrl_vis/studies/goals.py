@@ -35,8 +35,8 @@ FAMILY = Family(
     tasks=(FETCH, REACHER, SAWYER, HAND, FINGER, "FetchReach", "Reacher"),
     preset="fast",
     of_task=indicator.FAMILY.of_task,
-    longest={},
-    quick={},
+    max_steps={},
+    quick_changes={},
 )
 
 STUDIES: dict[str, Study] = {
@@ -45,6 +45,6 @@ STUDIES: dict[str, Study] = {
         "Learning from goal images",
         ("oracle", "autoencoder", "indicator", _OURS, "classifier", "contrastive", "td3_oracle"),
         {FETCH: 50_000, REACHER: 100_000, SAWYER: 100_000, HAND: 500_000, FINGER: 300_000},
-        others={"FetchReach": 50_000, "Reacher": 100_000},
+        optional_steps={"FetchReach": 50_000, "Reacher": 100_000},
     )
 }

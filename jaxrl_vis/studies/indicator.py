@@ -63,8 +63,8 @@ FAMILY = Family(
         ("fast", FINGER): {"trivial_goals": 1.0},
         ("cpu", FINGER): {"trivial_goals": 1.0},
     },
-    longest={},
-    quick={},
+    max_steps={},
+    quick_changes={},
 )
 
 STUDIES: dict[str, Study] = {
@@ -73,7 +73,7 @@ STUDIES: dict[str, Study] = {
         "Rewards with and without ground truth",
         ("oracle", "autoencoder", "indicator", "indicator_balance_filter"),
         {REACHER: 100_000, FETCH: 100_000},
-        others=_OTHERS,
+        optional_steps=_OTHERS,
     ),
     "5.2": Study(
         FAMILY,

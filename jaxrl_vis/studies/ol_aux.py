@@ -107,8 +107,8 @@ FAMILY = Family(
     preset="paper",
     of_task=_OF_TASK,
     # Presets that learn faster than the authors' release need smaller budgets.
-    longest={"fast": {FETCH: 100_000, HAND: 2_000_000, FINGER: 500_000}},
-    quick=QUICK,
+    max_steps={"fast": {FETCH: 100_000, HAND: 2_000_000, FINGER: 500_000}},
+    quick_changes=QUICK,
 )
 
 STUDIES: dict[str, Study] = {
@@ -124,7 +124,7 @@ STUDIES: dict[str, Study] = {
         "Single auxiliary tasks, and OL-AUX-5 with all of them",
         (*AUX_TASKS, "ol_aux_5"),
         {FETCH: 250_000, HAND: 1_000_000, FINGER: 1_000_000},
-        extra=("none",),
+        extra_variants=("none",),
     ),
     "5.6": Study(
         FAMILY,
@@ -137,7 +137,7 @@ STUDIES: dict[str, Study] = {
         "What OL-AUX-5 owes to looking ahead",
         ("ol_aux_1", "ol_aux_5_ablation", "ol_aux_5"),
         {FETCH: 250_000, HAND: 600_000},
-        extra=("none",),
+        extra_variants=("none",),
     ),
 }
 

@@ -33,8 +33,8 @@ FAMILY = Family(
     tasks=(FETCH, HAND, FINGER),
     preset="fast",
     of_task={},
-    longest={},
-    quick={},
+    max_steps={},
+    quick_changes={},
 )
 
 STUDIES: dict[str, Study] = {

@@ -177,8 +177,8 @@ def split_result(result: Any, has_aux: bool) -> tuple[Losses, Any]:
     is_pair = isinstance(result, tuple) and len(result) == 2
     losses, extra = result if has_aux and is_pair else (result, None)
     if not isinstance(losses, Mapping) or (has_aux and not is_pair):
-        wanted = "losses by name, and what is beside them" if has_aux else "a dictionary of losses by name"
-        hint = "" if has_aux or not is_pair else "; has_aux=True takes what is beside them"
+        wanted = "losses by name, and an auxiliary output" if has_aux else "a dictionary of losses by name"
+        hint = "" if has_aux or not is_pair else "; has_aux=True takes an auxiliary output, too"
         raise RequestError(f"losses_fn must return {wanted}, not a {type(result).__name__}{hint}")
     for name, loss in losses.items():
         if shape := getattr(loss, "shape", ()):

@@ -41,8 +41,8 @@ def graddrop(leak: float = 0.0, seed: int = 0) -> Weighting:
     """Keep only gradients of one sign in each parameter (GradDrop; Chen et al., 2020, "Just Pick a Sign", algorithm 1).
 
     Positive gradients are kept with probability P = (1 + sum_i g_i / sum_i |g_i|) / 2, otherwise negative ones. The paper masks
-    gradients of a layer's activations, with f = identity; this function, like other implementations, those of the parameters.
-    The noise vanishes where losses agree.
+    gradients of a layer's activations, with f = identity; this function masks those of the parameters, as other implementations
+    do. The noise vanishes where losses agree.
 
     Args:
         leak: Fraction of each gradient that is kept regardless of its sign.

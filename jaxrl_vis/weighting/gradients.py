@@ -1,6 +1,6 @@
 """Gradients of several losses, the statistics that weightings need, and the weighted sum.
 
-`weighted_grad` is to a dictionary of losses what `jax.grad` is to a single one. It computes gradients by one of two methods,
+`weighted_grad` is to a dictionary of losses what `jax.grad` is to a single one. It computes gradients in one of two modes,
 which agree up to rounding:
 
     per_loss   one `jax.grad` for each loss: the reference, and the default                    losses, dots, gramian, gradients
@@ -10,7 +10,7 @@ which agree up to rounding:
                <grad L_main, grad L_i> = <J grad L_main, g_i>, where J grad L_main is the
                tangent of z (`latents`)                                                        losses, dots, gramian
 
-The values of `Weighting.needs` that each supports are on the right. For dots, the second method makes as many passes through
+The values of `Weighting.needs` that each supports are on the right. For dots, the second mode makes as many passes through
 the shared parameters for ten losses as for two. For a Gramian it makes one backward and one forward-mode pass per loss, one
 after the other, so that no [K, parameters] Jacobian is stored. Heads are never differentiated in forward mode. Operations that
 are differentiated in forward mode need tangent rules, which `jax.custom_vjp` lacks: ``forwards`` may be a context in which such
@@ -154,31 +154,34 @@ def weighted_grad(
         weighting: Weighting, such as from `make_weighting`.
         shared: Function that selects the parameters in which gradients are compared, for instance
             ``lambda params: params["encoder"]``. It must return parts of its argument unmodified.
-        mode: Method of computing gradients, see the module docstring.
+        mode: Mode in which gradients are computed, see the module docstring.
         has_aux: See ``losses_fn``.
         reduce: Function applied to losses, gradients and dots before the weighting reads them, for use if each device has its
             own part of the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``. Inside `jax.shard_map`
             this needs ``check_vma=False``; otherwise, gradients with respect to replicated parameters are already summed.
         forwards: Factory of the context for tracing forward-mode differentiation.
         encode: (shared parameters, *args) -> latents, any tree of arrays. ``losses_fn`` must read the shared parameters only
-            through these. Required by the method latents, optional with per_loss. Or a dictionary of such functions; latents
+            through these. Required by mode latents, optional with per_loss. Or a dictionary of such functions; latents
             are then a dictionary with the same keys, and gradients pass only through those that a loss reads.
 
     Returns:
-        (params, state, *args) -> `Weighted`, with state from ``weighting.init(names, shared(params))``.
+        (params, state, *args) -> `Weighted`. The initial state is ``weighting.init(names, shared(params))``, or
+        ``weighting.init(names, shared(params), params)`` if ``weighting.hold`` is not None.
 
     Raises:
-        RequestError: The method is unknown, does not support the weighting, or is latents without ``encode``; from the returned
+        RequestError: The mode is unknown, does not support the weighting, or is latents without ``encode``; from the returned
             function: ``losses_fn`` does not return a dictionary of scalars, or the losses are not those with which the state
             was initialised.
     """
     if mode not in get_args(GradientMode):
         raise RequestError(f"unknown gradient mode {mode!r}{nearest(mode, get_args(GradientMode))}")
     if mode == "latents" and weighting.needs == "gradients":
-        raise RequestError(f"weighting {weighting.name} needs whole gradients, which latents does not find; use per_loss")
+        raise RequestError(
+            f"weighting {weighting.name} needs whole gradients, which mode latents does not compute; use per_loss"
+        )
     if mode == "latents":
         if encode is None:
-            raise RequestError("mode latents needs to know what the latents are: give encode")
+            raise RequestError("mode latents needs the function that computes the latents: give encode")
         return functools.partial(_gradient_by_latents, losses_fn, weighting, shared, has_aux, reduce, forwards, encode)
 
     def encoded_losses(params: Params, *args: Any) -> Any:

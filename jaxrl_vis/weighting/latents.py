@@ -1,4 +1,4 @@
-"""Gradients of losses that read the shared parameters only through latents (method latents of `gradients`).
+"""Gradients of losses that read the shared parameters only through latents (mode latents of `gradients`).
 
     encode          latents of every group, with their pullbacks
     differentiate   gradient of each loss with respect to the parameters and latents that it reads

@@ -80,7 +80,7 @@ def nonnegative(
 
 
 def _pivot(matrix: jax.Array, target: jax.Array, free: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Solve the problem of `nonnegative` for a positive definite matrix; arguments and results as there."""
+    """Solve the problem of `nonnegative` for a positive definite matrix, with the same arguments and results."""
     count, eps = len(target), jnp.finfo(matrix.dtype).eps
 
     def solve(free: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -75,7 +75,7 @@ def test_a_damaged_record_is_named(tmp_path: Path) -> None:
 def test_an_edited_table_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store(tmp_path, a=record("VisualNear", "features"))
     monkeypatch.setitem(pages.PAGES[PAGE], "audit", lambda _: audit.audit_table(tmp_path))
-    monkeypatch.setattr(check_claims, "OF_LEARNING", {PAGE: "audit"})
+    monkeypatch.setattr(check_claims, "LEARNING_TABLES", {PAGE: "audit"})
     monkeypatch.setattr(check_claims, "CHECKOUT", tmp_path)
     page = tmp_path / PAGE
     page.parent.mkdir()

@@ -70,7 +70,7 @@ def test_an_edited_table_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_an_edited_sentence_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(prose, "CHECKOUT", tmp_path)
-    monkeypatch.setattr(prose, "OTHERS", {"page.md": ("a discount of 0.98",)})
+    monkeypatch.setattr(prose, "OTHER_NUMBERS", {"page.md": ("a discount of 0.98",)})
     page = tmp_path / "page.md"
     page.write_text("With a discount of 0.98 it has\n0.75 of them (`--x 0.3`).\n\n| 0.11 |\n")
     right = Sentence("page.md", "it has 0.75 of them", "a record")

@@ -146,8 +146,9 @@ def test_what_was_not_looked_at_is_not_called_good(tmp_path: Path, capsys: pytes
 
 @pytest.mark.parametrize("name", staleness.MEASURED)
 def test_measured_files_are_there(name: str, checkout: Path) -> None:
-    for on_cpu in (True, False):
-        assert list(staleness.measured_files(name, "VisualFetchReach", on_cpu, checkout))
+    for env in ("VisualFetchReach", "VisualFetchPush"):  # the second modifies the model of the first
+        for on_cpu in (True, False):
+            assert list(staleness.measured_files(name, env, on_cpu, checkout))
 
 
 def test_every_kept_record_has_a_list_of_files() -> None:
@@ -181,7 +182,7 @@ def test_tables_go_between_their_markers(page: Path, tmp_path: Path) -> None:
     folder = tmp_path
     with pytest.raises(RequestError, match="speed table: begin"):
         list(pages.write_pages(folder, folder))
-    assert list(pages.outdated(folder, folder))[0].startswith(f"{tables.PAGE}: there are no markers")
+    assert list(pages.outdated_page_messages(folder, folder))[0].startswith(f"{tables.PAGE}: there are no markers")
     with page.open("a") as file:
         file.write("<!-- speed table: begin (so) -->\n<!-- speed table: end -->\nafter\n")
     assert list(pages.write_pages(folder, folder)) == [(page, True)]

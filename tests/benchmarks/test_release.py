@@ -99,7 +99,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Checks that take no time, of which one fails, and a training that only returns its results."""
 
     def train(self: platform_report.Training) -> str:
-        self.figures = {"task": "Thing", "preset": "debug", "env_steps": 8, "env_steps_per_s": 1234.5, "wall_s": 1.0}
+        self.results = {"task": "Thing", "preset": "debug", "env_steps": 8, "env_steps_per_s": 1234.5, "wall_s": 1.0}
         return "8 steps"
 
     def broken() -> str:

@@ -173,7 +173,7 @@ def test_defaults_follow_the_method() -> None:
     assert resolved["oracle"].filter_threshold == resolved["indicator"].filter_threshold == math.inf
     best = 1 / (1 - discount)
     assert resolved["indicator_balance_filter"].filter_threshold == pytest.approx((-1 + discount * best + best) / 2)
-    assert METHODS["indicator_balance_filter"].balance and not METHODS["indicator"].balance
+    assert METHODS["indicator_balance_filter"].balance_probability == 0.5 and METHODS["indicator"].balance_probability == 0.0
     assert [name for name in METHODS if METHODS[name].needs_images] == ["autoencoder", "classifier", "features"]
     autoencoder = resolved["autoencoder"]
     assert (autoencoder.reward_positive, autoencoder.reward_negative, autoencoder.balance_probability) == (1.0, 0.0, 0.0)

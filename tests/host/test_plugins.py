@@ -89,7 +89,7 @@ def test_a_strangers_part_is_asked_about(elsewhere: Path, capsys: pytest.Capture
         ({"aux_tasks": ("egomotoin",)}, "aux_tasks cannot be 'egomotoin'; did you mean egomotion?"),
         ({"weighting": "my_weighting:mkae"}, "my_weighting has no mkae; did you mean make?"),
         ({"algorithm": "my_algorythm:make"}, "there is no module my_algorythm"),
-        ({"algorithm": "my_algorithm:STEP_SIZE"}, "my_algorithm:STEP_SIZE is no algorithm"),
+        ({"algorithm": "my_algorithm:STEP_SIZE"}, "my_algorithm:STEP_SIZE is not an algorithm"),
         ({"method": "my_method:nearly_equal"}, "method my_method:nearly_equal cannot be made: TypeError"),
     ],
 )

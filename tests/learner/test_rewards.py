@@ -35,7 +35,7 @@ def test_a_tolerance_forgives_noise_and_small_things():
     reached[2, 0, 0, 0] = 0  # one element in a hundred is another
     reached[3, 0, 0, :2] = 0  # two are
     method, config = METHODS["indicator_tolerance"], preset("debug", method="indicator_tolerance")
-    assert method.filter and method.balance
+    assert method.filter and method.balance_probability > 0
     reward = make_reward(config, method)(pair(reached, goal), reached, 1.0, -1.0)
     np.testing.assert_array_equal(reward, [1.0, 1.0, 1.0, -1.0])
     exact = make_reward(config, METHODS["indicator"])(pair(reached, goal), reached, 1.0, -1.0)
@@ -125,7 +125,7 @@ def test_a_missing_or_wrong_encoder_gets_one_line(tmp_path):
         arrays = dict(file)
     np.savez(tmp_path / "cut.npz", **{**arrays, "kernel_1": arrays["kernel_1"][:3]})
     for name in ("other", "text", "missing", "cut"):
-        with pytest.raises(RequestError, match=f"{name}.npz is no encoder") as refused:
+        with pytest.raises(RequestError, match=f"{name}.npz is not an encoder") as refused:
             make_reward(config.replace(reward_encoder=str(tmp_path / f"{name}.npz")), METHODS["features"])
         assert "\n" not in str(refused.value)
     encode = frozen_encoder.load(tmp_path / "encoder.npz")

@@ -27,7 +27,7 @@ def test_every_comparison_has_a_recording():
 
 
 @functools.cache
-def compared(name: str) -> list[parity.Figure]:
+def compared(name: str) -> list[parity.Measure]:
     with np.load(DATA / f"{name}.npz") as recording:
         # What two substeps do has no bound, but another program to compile; a few of the many pushes are enough.
         parts = {key: recording[key][:PUSHES] if name == "fetch_push" else recording[key] for key in recording}
@@ -36,17 +36,17 @@ def compared(name: str) -> list[parity.Figure]:
 
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_tasks_follow_the_recordings_of_their_originals(name):
-    figures = compared(name)
-    for figure in figures:
-        print(figure)
-    assert any(figure.bound is not None for figure in figures)
-    assert not [figure for figure in figures if figure.is_broken]
+    measures = compared(name)
+    for measure in measures:
+        print(measure)
+    assert any(measure.bound is not None for measure in measures)
+    assert not [measure for measure in measures if measure.is_broken]
 
 
 @pytest.mark.parametrize("name", ["fetch_reach", "fetch_reach_table"])
 def test_most_of_the_fetch_recordings_count(name):
-    figures = {figure.name: figure.value for figure in compared(name)}
-    assert figures["share of the recording that counts (near the start)"] > 0.5
+    measures = {measure.name: measure.value for measure in compared(name)}
+    assert measures["share of the recording that counts (near the start)"] > 0.5
 
 
 def test_pushes_that_move_nothing_are_found_out():
@@ -54,8 +54,8 @@ def test_pushes_that_move_nothing_are_found_out():
         still = {key: recording[key][:PUSHES] for key in ("actions", "observations")}
     still["observations"][:, :, 3:6] = still["observations"][:, :1, 3:6]
     still["actions"][:, :, 2] = 1.0  # the gripper rises and touches nothing
-    figures = parity.compare("FetchPush", still)
-    broken = [figure.name for figure in figures if figure.is_broken]
+    measures = parity.compare("FetchPush", still)
+    broken = [measure.name for measure in measures if measure.is_broken]
     assert "share of sequences in which the box moves less than 5 cm" in broken
     assert "box at the end: median error" not in broken
 
@@ -85,10 +85,10 @@ def test_a_box_that_is_pushed_off_the_table_lies_on_the_floor():
 
 
 def test_contacts_matter_to_the_hand():
-    figures = {figure.name: figure.value for figure in compared("hand_reach")}
+    measures = {measure.name: measure.value for measure in compared("hand_reach")}
     for finger in ("ring finger", "little finger"):
         name = f"{finger}: 95th percentile of the error"
-        assert figures[f"without contacts, {name}"] > max(3 * figures[name], 0.008)
+        assert measures[f"without contacts, {name}"] > max(3 * measures[name], 0.008)
 
 
 def test_a_step_of_the_fetch_robot():
@@ -126,7 +126,7 @@ def test_a_drifting_reacher_is_found_out(tmp_path, capsys):
 
 
 def test_a_recording_that_is_not_a_number_breaks_its_bounds():
-    assert parity.Figure("error", float("nan"), "m", 1.0).is_broken
+    assert parity.Measure("error", float("nan"), "m", 1.0).is_broken
 
 
 def test_nothing_to_compare(tmp_path, capsys):

@@ -274,9 +274,9 @@ def test_a_contract_or_frames_that_do_not_fit_are_told(kind: str, copied: Any, e
         check_file(folder)
     for text, words in (
         ("{", "is not JSON"),
-        ("{}", "is no contract"),
+        ("{}", "is not a contract"),
         ('{"schema": 9}', "is of schema 9, not 1"),
-        ((exported["Told", kind] / "contract.json").read_text().replace('"batch"', "-1"), "is no contract"),
+        ((exported["Told", kind] / "contract.json").read_text().replace('"batch"', "-1"), "is not a contract"),
     ):
         (folder / "contract.json").write_text(text)
         with pytest.raises(RequestError, match=words):

@@ -153,10 +153,12 @@ def test_a_logger_that_fails_is_one_line_and_no_more(
     def unreachable(**_: Any) -> None:
         raise wandb.errors.CommError("timed out\nconsider more patience")
 
-    rows = tensorboard.TensorBoard.rows
+    rows = tensorboard.TensorBoard.log_rows
     calls = []
     monkeypatch.setattr(
-        tensorboard.TensorBoard, "rows", lambda self, new: (calls.append(new), full() if len(calls) > 2 else rows(self, new))
+        tensorboard.TensorBoard,
+        "log_rows",
+        lambda self, new: (calls.append(new), full() if len(calls) > 2 else rows(self, new)),
     )
     monkeypatch.setattr(wandb, "init", unreachable)
     path = tmp_path / "run"

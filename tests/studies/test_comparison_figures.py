@@ -1,4 +1,4 @@
-"""Figures ``goals`` and ``weightings``: runs have the settings that they are named after, and a table is that of invented runs."""
+"""Figures ``goals`` and ``weightings``: runs have the settings that their names say, and a table is that of invented runs."""
 
 import csv
 import json
@@ -32,7 +32,7 @@ def test_algorithms_of_the_figure_have_what_presets_give_them() -> None:
 
 
 def test_every_run_of_the_figure_is_valid_and_untuned() -> None:
-    tasks = (*STUDY.steps, *STUDY.others)
+    tasks = (*STUDY.steps, *STUDY.optional_steps)
     cells = make_cells(STUDY, tuple(STUDY.steps), tuple(goals.VARIANTS), Scope("fast"))
     assert len(cells) == 5 * len(goals.VARIANTS)
     assert {cell.config.network.random_shift for (cell,) in cells.values()} == {0}

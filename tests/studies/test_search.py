@@ -119,7 +119,7 @@ def test_another_search_is_refused(tmp_path: Path) -> None:
         with pytest.raises(RequestError, match=words):
             search(asked, Script())
     (tmp_path / JOURNAL).write_text("no journal\n")
-    with pytest.raises(RequestError, match="search.journal is no journal of a search"):
+    with pytest.raises(RequestError, match="search.journal is not a journal of a search"):
         search(request(tmp_path), Script())
 
 
@@ -135,7 +135,7 @@ def test_another_search_is_refused(tmp_path: Path) -> None:
         ("batch_size=4..x", "batch_size"),
         ("batch_size=4", "name two values or more, or set it with --batch-size"),
         ("pixels=rgb,hyperspectral", "pixels cannot be 'hyperspectral'"),
-        ("encoders=a..b", "encoders is no number: list its values"),
+        ("encoders=a..b", "encoders is not a number: list its values"),
     ],
 )
 def test_ranges_that_cannot_be_are_told_in_one_line(text: str, words: str) -> None:

@@ -56,7 +56,7 @@ def slope(speed: float) -> Callable[[int], float]:
 
 def all_cells(figure: str, tasks=(), variants=(), **scope) -> dict[tuple[str, str], list[Cell]]:
     study = STUDIES[figure]
-    return make_cells(study, tasks or tuple(study.steps), variants or (*study.extra, *study.variants), Scope(**scope))
+    return make_cells(study, tasks or tuple(study.steps), variants or (*study.extra_variants, *study.variants), Scope(**scope))
 
 
 def test_the_cells_are_those_of_the_issue() -> None:
@@ -389,7 +389,7 @@ def test_seeds_of_several_runs_are_one_line(tmp_path: Path) -> None:
         (["5.4", "--minutes", "3", "--draw-only"], ["leave out --minutes"]),
         (["5.6", "--methods", "ol_aux_5", "ol_aux_1"], ["weights of one method", "ol_aux_1"]),
         (["5.6", "--methods", "sum"], ["weights of one method that learns them", "ol_aux_5"]),
-        (["5.4", "--runs", "nowhere", "--draw-only"], ["--runs nowhere is no folder", "--draw-only draws trained runs"]),
+        (["5.4", "--runs", "nowhere", "--draw-only"], ["--runs nowhere is not a folder", "--draw-only draws trained runs"]),
         (["5.4", "--runs", "/proc/x"], ["cannot write --runs /proc/x"]),
         (["5.4", "--out", "x.gif"], ["--out x.gif", ".png"]),
         (["quadratic", "--tasks", FETCH], ["--tasks", "not with quadratic"]),

@@ -379,7 +379,7 @@ def test_losses_of_another_form_get_one_line(mode: Any) -> None:
         (lambda point: {MAIN: point**2, "near": jnp.sum(point)}, False, "loss 'main' has shape (2,) and must be one number"),
         (lambda point: jnp.sum(point), False, "losses_fn must return a dictionary of losses by name, not a "),
         (lambda point: ({MAIN: jnp.sum(point), "near": jnp.sum(point)}, 1), False, "has_aux=True"),
-        (lambda point: {MAIN: jnp.sum(point), "near": jnp.sum(point)}, True, "losses by name, and what is beside them"),
+        (lambda point: {MAIN: jnp.sum(point), "near": jnp.sum(point)}, True, "losses by name, and an auxiliary output"),
     ):
         with pytest.raises(RequestError) as caught:
             weighted_grad(losses_fn, weighting, mode=mode, has_aux=has_aux)(jnp.ones(2), weighting.init((MAIN, "near")))

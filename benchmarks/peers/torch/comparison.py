@@ -67,7 +67,7 @@ def load() -> Any:
     try:
         learner = importlib.import_module("benchmarks.peers.torch.learner")
     except ImportError as error:
-        raise RequestError(f"the peer torch needs PyTorch, which is no dependency: pip install torch ({error})") from error
+        raise RequestError(f"the peer torch needs PyTorch, which is not a dependency: pip install torch ({error})") from error
     if jax.default_backend() == "gpu" and not learner.torch.cuda.is_available():
         raise RequestError(f"the peer torch needs a PyTorch that sees the GPU; {learner.torch.__version__} does not")
     return learner
@@ -127,7 +127,7 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
 
     def step(with_actor: bool, train: TrainState, replay: ReplayState, choice: Choice) -> tuple[TrainState, jax.Array, Any]:
         working = algorithm.begin(train.agent, train.statistics)
-        # The actor's gradient is computed in every step, but applied only in the actor's turns.
+        # The actor's gradient is computed in every step, but applied only in steps that update the actor.
         gradients, metrics = algorithm.gradients(working, algorithm.prepare(working, sampler.batch(replay, choice)), True)
         losses = jnp.stack([metrics["train/critic_loss"], metrics["train/actor_loss"]])
         taken = gradients if with_actor else gradients._replace(actor=None)
@@ -139,9 +139,9 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
     losses, gradients = [], []
     with jax.default_matmul_precision("highest"):
         for index in range(STEPS):
-            turn = (index + 1) % config.ddpg.actor_interval == 0
+            with_actor = (index + 1) % config.ddpg.actor_interval == 0
             choice = jax.tree.map(lambda leaf, index=index: leaf[index], choices)
-            now, step_losses, step_gradients = jax.device_get(stepped(turn, now, replay, choice))
+            now, step_losses, step_gradients = jax.device_get(stepped(with_actor, now, replay, choice))
             losses.append(step_losses)
             gradients.append(step_gradients)
     names = ("actor", "critic", "target_actor", "target_critic")
@@ -314,7 +314,7 @@ def measure(program: TrainStep, train: TrainState, replay: ReplayState, repeats:
         program: Our program, one call of which takes ``updates_per_iteration`` steps.
         train, replay: State of one seed, without the seed's axis.
         repeats: Maximum number of timed repeats.
-        ours: Our figure for the same configuration.
+        ours: Our measurement for the same configuration.
 
     Raises:
         AssertionError: PyTorch does not compute what we do.

@@ -318,7 +318,7 @@ class Learner:
         Args:
             choices: Batches [steps, 3, B] int64, see `draw`.
             cursor: Index of the step, [1] int64; incremented in place.
-            next_updates: Flags for the actor's turn and the target networks' turn.
+            next_updates: Whether this step updates the actor, and whether it updates the target networks.
         """
         critic_error, policy_loss, critic, actor = self.gradients(choices.index_select(0, cursor)[0], next_updates[0])
         self.apply(critic, actor, next_updates[1])

@@ -52,7 +52,7 @@ METHODS: dict[str, Callable[[torch.Tensor], np.ndarray]] = {
 }
 
 
-def drawn(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+def random_directions(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     """Compute the directions [n, SIZE] of random methods by name, with the file's random numbers instead of PyTorch's."""
     jacobians = torch.from_numpy(arrays[f"{prefix}/jacobians"])
     results: dict[str, list[np.ndarray]] = {name: [] for name in ("pcgrad", "gradvac", "graddrop", "random")}
@@ -126,7 +126,7 @@ def compute(prefix: str, path: str) -> dict[str, np.ndarray]:
         results[f"{prefix}/{name}"] = np.full((len(jacobians), len(directions[0])), np.nan)
         results[f"{prefix}/{name}"][chosen] = np.stack(directions)
         print(prefix, name, flush=True)
-    results |= {f"{prefix}/{name}": value for name, value in drawn(arrays, prefix).items()}
+    results |= {f"{prefix}/{name}": value for name, value in random_directions(arrays, prefix).items()}
     by_path = [dict(paths(losses)) for losses in torch.from_numpy(arrays[f"{prefix}/losses"])]
     return results | {f"{prefix}/{name}": np.stack([outcome[name] for outcome in by_path]) for name in by_path[0]}
 

@@ -66,7 +66,7 @@ def mesh(number: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]
 
 
 def _lump(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Make a ball whose radius varies by random waves, as `_closed` returns it."""
+    """Make a ball whose radius varies by random waves. Results as in `_closed`."""
     waves, phases = rng.normal(size=(6, 3)) * 2.0, rng.uniform(0.0, 2.0 * np.pi, 6)
     heights = rng.uniform(0.05, 0.15, 6)
 
@@ -78,7 +78,7 @@ def _lump(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rounded_box(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Make a superellipsoid, as `_closed` returns it."""
+    """Make a superellipsoid. Results as in `_closed`."""
     power, half = rng.uniform(0.25, 0.6), rng.uniform(0.4, 1.0, 3)
 
     def surface_point(polar: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
@@ -89,7 +89,7 @@ def _rounded_box(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _bowl(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Make a surface of revolution: the outside of a bowl, and the inside back to the axis. Returns as `_closed`."""
+    """Make a surface of revolution: the outside of a bowl, and the inside back to the axis. Results as in `_closed`."""
     height, wall, lip = rng.uniform(0.5, 1.6), rng.uniform(0.75, 0.9), rng.uniform(0.8, 1.3)
 
     def surface_point(polar: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
@@ -103,7 +103,7 @@ def _bowl(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ring(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Make a torus with a twisted, wavy cross-section. Returns as `_closed`."""
+    """Make a torus with a twisted, wavy cross-section. Results as in `_closed`."""
     thickness, turns, wave = rng.uniform(0.25, 0.4), rng.integers(1, 4), rng.uniform(0.1, 0.35)
     ring, tube = np.meshgrid(*(2.0 * np.pi * np.arange(count) / count for count in (_AROUND, _ALONG)), indexing="ij")
     radius = thickness * (1.0 + wave * np.cos(2.0 * (tube + turns * ring)))

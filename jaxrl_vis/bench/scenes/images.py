@@ -1,6 +1,6 @@
 """Our renderer on the scenes of `models`: images per second of every output, size and batch.
 
-Poses are in world coordinates; images have 8-bit colours and float32 depth in metres, and those of meshes labels, too. A
+Poses are in world coordinates; images have 8-bit colours and float32 depth in metres, those of meshes also labels. A
 renderer's own preparation for a new pose (culling, refitting of bounding volumes) is included in its time.
 """
 
@@ -178,7 +178,7 @@ def measure_output(case: Case, output: str, repeats: int) -> Measurement:
     scene = make_scene(case)
     batches = [{name: jnp.asarray(rows[: case.worlds]) for name, rows in batch.items()} for batch in case.batches]
 
-    # Tables of thousands of triangles are no constants of a program, unlike all that a scene without them has.
+    # Tables of thousands of triangles are not constants of a program, unlike all that a scene without them has.
     scene_argument = None if scene.hierarchies is None else scene
 
     def draw(scene_argument: Scene | None, poses: dict[str, jax.Array]) -> Any:

@@ -48,7 +48,7 @@ def load(scene: str, textures: bool = True, highlights: bool = True, shadows: bo
             try:
                 mj_model = mujoco.MjModel.from_xml_path(str(path))
             except ValueError as error:
-                raise RequestError(f"{path} is no MuJoCo model: {' '.join(str(error).split())}") from error
+                raise RequestError(f"{path} is not a MuJoCo model: {' '.join(str(error).split())}") from error
     if not mj_model.ncam:
         raise RequestError(f"scene {scene} has no camera: give it one in its <worldbody>")
     mj_model.vis.quality.offsamples = 0

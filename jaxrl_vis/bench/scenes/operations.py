@@ -1,6 +1,6 @@
 """Minimum number of arithmetic operations of an image: the renderer's own functions under perfect culling.
 
-The compiler's count is no substitute: it includes tests that a kernel skips, and nothing inside a kernel. Here every operation
+The compiler's count is not a substitute: it includes tests that a kernel skips, and nothing inside a kernel. Every operation
 on a pixel counts as one (a fused multiply-add as two, a square root as one): once per pixel and object that must be tested, and
 once per pixel for depth, normal, texture and colour. Work done once per environment is not counted.
 """

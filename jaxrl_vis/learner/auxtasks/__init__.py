@@ -56,5 +56,5 @@ def make(names: Sequence[str], spec: Spec, folder: str | None = None) -> dict[st
     built = [build_component("auxiliary task", name, maker, spec, expected_type=AuxTask) for name, maker in zip(names, makers)]
     tasks = {task.name: task for task in built}
     if len(tasks) < len(built):
-        raise RequestError(f"two auxiliary tasks call themselves alike ({', '.join(task.name for task in built)}): rename one")
+        raise RequestError(f"two auxiliary tasks have the same name ({', '.join(task.name for task in built)}): rename one")
     return tasks

@@ -33,7 +33,7 @@ class Auxiliary:
     Attributes:
         tasks: Tasks by name.
         weighting: Weighting of their losses and the main one.
-        gradient_mode: Method of computing the losses' gradients (`weighting.gradients`).
+        gradient_mode: Mode in which the losses' gradients are computed (`weighting.gradients`).
     """
 
     tasks: dict[str, AuxTask]

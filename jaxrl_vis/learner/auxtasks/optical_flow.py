@@ -80,7 +80,7 @@ def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int =
 
 
 def flow_strength_along(images: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:
-    """Compute `flow_strength` between successive images: [T + 1, C, H, W] -> [T, H, W] float32; options as there."""
+    """Compute `flow_strength` between successive images: [T + 1, C, H, W] -> [T, H, W] float32, with its options."""
     return _strength(farneback.flow_along(grey(images, frame_stack) / _unit(stretch)), stretch)
 
 

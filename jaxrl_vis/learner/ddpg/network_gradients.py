@@ -54,7 +54,7 @@ class NetworkGradients(NamedTuple):
 def critic_of_images(
     objectives: Objectives, copies: ComputeCopies, prepared: PreparedBatch, state: WeightingState, with_actor: bool
 ) -> NetworkGradients:
-    """Compute the gradients if both networks observe the same.
+    """Compute the gradients if both networks have the same observations.
 
     Args:
         objectives: Losses.

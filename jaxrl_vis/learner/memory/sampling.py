@@ -42,7 +42,7 @@ class Choice(NamedTuple):
         target_key: [] typed key, for targets of auxiliary tasks; None without any.
         clutter_end: [] float32, see `reward_errors`; None if false rewards are not confined.
         is_replaceable: [B] bool, mask of relabelled goals to be replaced by another transition's if they are already reached;
-            None if none is, or if true states have decided that (``goal_episode``).
+            None if there are none, or if true states have determined them (``goal_episode``).
     """
 
     indices: Indices
@@ -123,8 +123,8 @@ class Sampler:
     def _replace_trivial_goals(self, state: ReplayState, choice: Choice, key: jax.Array) -> Choice:
         """Substitute goals of another episode for the relabelled goals that the transition has reached before its action.
 
-        A fraction ``trivial_goals`` of these goals is kept. Rewards that compare observations cannot tell yet which goals are
-        reached: then only ``is_replaceable`` is set, for `_replace_reached_goals`.
+        A fraction ``trivial_goals`` of these goals is kept. With rewards that compare observations, the reached goals are
+        not known yet: then only ``is_replaceable`` is set, for `_replace_reached_goals`.
 
         They are not replaced by original goals. If these look different from observations in episodes (VisualFingerTurn's
         finger always hangs down in them), rarely reached goals would all share that look, and the critic could infer rewards

@@ -26,7 +26,7 @@ _LIMIT = 5.0  # clipping bound of normalised values, the default of ``normalizer
 def save(path: Path | str, encoder: Params, scaling: Scaling) -> None:
     """Write an encoder to a file: parameters of `modules.Encoder`, and the scaling of its images [C, H, W].
 
-    ``.npz`` is appended to the name unless it ends so (`numpy.savez`).
+    ``.npz`` is appended to the name unless it ends in it (`numpy.savez`).
     """
     arrays = {name: leaf for name, leaf in encoder.items() if name != "latent"}
     arrays |= {f"latent/{name}": leaf for name, leaf in encoder["latent"].items()}
@@ -52,10 +52,10 @@ def load(path: Path | str) -> Callable[[jax.Array], jax.Array]:
         jax.eval_shape(lambda images: encoder.apply(params, to_blocks(images, len(filters))), blocks)
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise RequestError(
-            f"{path} is no encoder that jaxrl-vis encoder wrote: {' '.join(str(error).split())[:120]}"
+            f"{path} is not an encoder that jaxrl-vis encoder wrote: {' '.join(str(error).split())[:120]}"
         ) from error
     except Exception as error:  # flax raises its own exceptions for parameters of the wrong shape
-        raise RequestError(f"{path} is no encoder: its arrays do not fit together") from error
+        raise RequestError(f"{path} is not an encoder: its arrays do not fit together") from error
 
     def encode(images: jax.Array) -> jax.Array:
         if images.shape[1:] != shape:

@@ -72,7 +72,7 @@ class Encoder(nn.Module):
 
 
 class Dense(nn.Module):
-    """Dense layer [B, inputs] -> [B, size], as `flax.linen.Dense`.
+    """Dense layer [B, inputs] -> [B, size], like `flax.linen.Dense`.
 
     Inputs may be passed as parts, arrays [B, part] or [parts, B, part], which are not concatenated in memory.
 

@@ -182,7 +182,7 @@ class Networks:
         return Encoder(self.config.network.encoder_filters, self.config.network.latent_size, self.dtype)
 
     def head(self, outputs: int, output_bias: float = 0.0, stabilized: bool = False) -> Any:
-        """Build a head with the configured hidden layers, a flax module (`modules.Head`); arguments as there."""
+        """Build a head with the configured hidden layers, a flax module; arguments as for `modules.Head`."""
         return Head(self.config.network.hidden_sizes, outputs, output_bias, self.dtype, stabilized)
 
     @property

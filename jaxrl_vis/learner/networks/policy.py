@@ -1,6 +1,6 @@
-"""Deterministic policy of the shared networks: an actor, and the statistics that normalise its observations.
+"""Deterministic policy with an actor of `Networks`, and the statistics that normalise its observations.
 
-Implements `Algorithm.act`, ``encode_goal`` and ``policy_params`` for any algorithm whose actor is that of `Networks`.
+Implements `Algorithm.act`, ``encode_goal`` and ``policy_params`` for any algorithm with such an actor.
 """
 
 from collections.abc import Callable

@@ -117,7 +117,7 @@ class Layout:
             **options: Further arguments of ``jit``.
 
         Returns:
-            The compiled function, of whole arrays.
+            The jitted function, of whole arrays.
         """
         if self.mesh is None:
             return jit(function, **options)

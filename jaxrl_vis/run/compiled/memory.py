@@ -28,7 +28,7 @@ _BATCH_COPIES = 30
 
 
 def tree_bytes(shapes: Any) -> int:
-    """Count the bytes of all arrays (or their shapes) in a pytree; typed keys count as their words."""
+    """Count the bytes of all arrays (or their shapes) in a pytree; a typed key counts as 8 bytes of key data."""
 
     def size(leaf: Any) -> int:
         item = 8 if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf.dtype.itemsize

@@ -68,12 +68,12 @@ def dump(file: Path, loop: LoopState, values: PerSeed, leaves: list[str]) -> Non
     """Write an .npz for locating the source of a non-finite number. Runs on the host only, without compilation.
 
     ``train.*``: the learner. ``episodes.*``: states and actions of up to 64 replay episodes with a non-finite number, with
-    their seed_index and slot. ``metrics.*``: losses etc., [S]. ``key`` (words) and ``iteration``: the source of the next
-    iteration's random numbers. ``nonfinite_leaves``: the names in ``leaves``.
+    their seed_index and slot. ``metrics.*``: losses etc., [S]. ``key`` (key data) and ``iteration``: the source of the
+    next iteration's random numbers. ``nonfinite_leaves``: the names in ``leaves``.
 
     Args:
         file: Output file; its folder is created.
-        loop: State of the failed iteration, or of the next one, dispatched before the host knew.
+        loop: State of the failed iteration, or of the next one, dispatched before the host read them.
         values: Metrics of the failed iteration.
         leaves: Names of the learner's non-finite leaves.
     """

@@ -176,7 +176,7 @@ def read_contract(path: Path) -> Contract:
     except RequestError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise RequestError(f"{file} is no contract of an exported policy: {hint}") from error
+        raise RequestError(f"{file} is not a contract of an exported policy: {hint}") from error
     if path.is_file() and path.name not in (name, FILE):
         raise RequestError(f"{file} describes {name}, not {path.name}: name that file")
     if not (folder / name).is_file():

@@ -1,4 +1,4 @@
-"""Layers of a policy of the shared networks, as NumPy arrays by name, and a forward pass in NumPy.
+"""Layers of a policy with an actor of `Networks`, as NumPy arrays by name, and a forward pass in NumPy.
 
     observation, goal [N, C, H, W]     clip((x - mean) * scale, -limit, limit), float32
     encoder, the same for both         2x2 convolutions of stride 2, each with ReLU; flattened as [H, W, C]; one dense layer
@@ -80,7 +80,7 @@ def layers_of(policy: Policy) -> PolicyWeights:
     """Collect the layers of a policy.
 
     Raises:
-        RequestError: The policy is not one of the shared networks.
+        RequestError: The policy does not have an actor of `Networks`.
     """
     params, networks = policy.parameters, policy.algorithm.networks
     if not isinstance(params, PolicyParams) or not isinstance(networks, Networks):

@@ -127,7 +127,7 @@ class Model:
             raise RequestError(f"cannot read {path} ({error.strerror or error})") from error
         except Exception as error:  # onnxruntime's exceptions have no common base class
             raise RequestError(
-                f"{path} is no ONNX model that onnxruntime can run ({_first_line(error)}): export it again"
+                f"{path} is not an ONNX model that onnxruntime can run ({_first_line(error)}): export it again"
             ) from None
         self.inputs = {part.name: (tuple(part.shape), _dtype(part.type)) for part in self._session.get_inputs()}
         self.outputs = {part.name: (tuple(part.shape), _dtype(part.type)) for part in self._session.get_outputs()}

@@ -64,7 +64,7 @@ class Program:
             raise RequestError(f"cannot read {path} ({error.strerror or error})") from error
         except Exception as error:  # flatbuffers raises arbitrary exceptions on damaged offsets
             raise RequestError(
-                f"{path} is no StableHLO program that JAX {jax.__version__} can read: export it again"
+                f"{path} is not a StableHLO program that JAX {jax.__version__} can read: export it again"
             ) from error
 
     def __call__(self, observation: np.ndarray, goal: np.ndarray) -> np.ndarray:

@@ -42,7 +42,7 @@ class FittingProgress(Progress):
         super().__init__(console=Console(file=file), refresh_per_second=refresh_per_second)
 
     def get_renderables(self) -> Iterable[RenderableType]:
-        """Return one line per task."""
+        """Yield one line per task."""
         for task in self.tasks:
             yield self._line(task, self.console.width)
 

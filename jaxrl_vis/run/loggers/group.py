@@ -39,10 +39,10 @@ def check(names: Sequence[str]) -> None:
 class Logger(Protocol):
     """Interface of a logger. Any method may raise any exception."""
 
-    def rows(self, rows: Sequence[Row]) -> None:
+    def log_rows(self, rows: Sequence[Row]) -> None:
         """Log rows of metrics.jsonl."""
 
-    def image(self, name: str, file: Path, env_steps: int) -> None:
+    def log_image(self, name: str, file: Path, env_steps: int) -> None:
         """Log the image ``file``, a .png or .gif drawn after ``env_steps`` steps, as ``name``."""
 
     def close(self) -> None:
@@ -60,7 +60,7 @@ class Loggers:
 
     def __init__(self, names: Sequence[str], folder: Path, echo: Callable[[str], None]):
         self._names, self._folder, self._echo = tuple(dict.fromkeys(names)), folder, echo
-        self._open: dict[str, Logger] = {}
+        self._loggers: dict[str, Logger] = {}
 
     def open(self, record: Mapping[str, Any], seeds: Sequence[int], rows: Sequence[Row]) -> None:
         """Open the loggers.
@@ -73,21 +73,21 @@ class Loggers:
         for name in self._names:
 
             def begin(name: str = name) -> None:
-                self._open[name] = _open(name, self._folder, record, seeds, self._echo)
-                self._open[name].rows(rows)
+                self._loggers[name] = _open(name, self._folder, record, seeds, self._echo)
+                self._loggers[name].log_rows(rows)
 
             self._try(name, begin)
 
-    def rows(self, rows: Sequence[Row]) -> None:
+    def log_rows(self, rows: Sequence[Row]) -> None:
         """Forward rows to the loggers."""
-        for name, logger in list(self._open.items()):
-            self._try(name, lambda logger=logger: logger.rows(rows))
+        for name, logger in list(self._loggers.items()):
+            self._try(name, lambda logger=logger: logger.log_rows(rows))
 
-    def image(self, name: str, file: Path, env_steps: int) -> None:
+    def log_image(self, name: str, file: Path, env_steps: int) -> None:
         """Forward an image to the loggers, if the file exists."""
         if file.exists():
-            for logger_name, logger in list(self._open.items()):
-                self._try(logger_name, lambda logger=logger: logger.image(name, file, env_steps))
+            for logger_name, logger in list(self._loggers.items()):
+                self._try(logger_name, lambda logger=logger: logger.log_image(name, file, env_steps))
 
     def close(self, in_a_hurry: bool = False) -> None:
         """Close the loggers within a time limit: a library waiting for a network could otherwise block the end of the run.
@@ -95,8 +95,8 @@ class Loggers:
         Args:
             in_a_hurry: True after a signal: each logger gets 10 s instead of 60 s.
         """
-        for name in list(self._open):
-            logger = self._open.pop(name)
+        for name in list(self._loggers):
+            logger = self._loggers.pop(name)
             thread = threading.Thread(target=self._try, args=(name, logger.close), daemon=True)
             thread.start()
             thread.join(_LEAVING_S[in_a_hurry])
@@ -107,7 +107,7 @@ class Loggers:
         try:
             act()
         except Exception as error:
-            self._open.pop(name, None)
+            self._loggers.pop(name, None)
             description = " ".join(f"{type(error).__name__}: {error}".split())
             self._echo(f"--log {name} failed and is not used any more ({description[:200]}); metrics.jsonl has everything")
 

@@ -52,14 +52,14 @@ class TensorBoard:
         for writer in self._writers.values():
             writer.flush()
 
-    def rows(self, rows: Sequence[Row]) -> None:
-        """Log the figures of rows at their ``env_steps``."""
+    def log_rows(self, rows: Sequence[Row]) -> None:
+        """Log the metrics of rows at their ``env_steps``."""
         for row in rows:
             values = [summary_pb2.Summary.Value(tag=name, simple_value=value) for name, value in scalars(row).items()]
             self._write(row["seed"], row["env_steps"], summary=summary_pb2.Summary(value=values))
         self._flush()
 
-    def image(self, name: str, file: Path, env_steps: int) -> None:
+    def log_image(self, name: str, file: Path, env_steps: int) -> None:
         """Log the unchanged file: TensorBoard plays a .gif. It goes to the first seed, whose episodes the video shows."""
         from PIL import Image
 

@@ -82,8 +82,8 @@ class WeightsAndBiases:
     def _write_state(self) -> None:
         write_atomically(self._state_file, json.dumps(self._state, indent=2) + "\n")
 
-    def rows(self, rows: Sequence[Row]) -> None:
-        """Log the figures of new rows against ``env_steps``; W&B's own step is the iteration."""
+    def log_rows(self, rows: Sequence[Row]) -> None:
+        """Log the metrics of new rows against ``env_steps``; W&B's own step is the iteration."""
         for row in rows:
             known = self._state[str(row["seed"])]
             if row["iteration"] <= known["iteration"]:
@@ -93,8 +93,8 @@ class WeightsAndBiases:
             known["iteration"] = row["iteration"]
         self._write_state()
 
-    def image(self, name: str, file: Path, env_steps: int) -> None:
-        """Log the unchanged file with the first seed's latest figures."""
+    def log_image(self, name: str, file: Path, env_steps: int) -> None:
+        """Log the unchanged file in the first seed's W&B run, at the iteration of its latest row."""
         seed, run = next(iter(self._runs.items()))
         media = wandb.Video(str(file), format="gif") if file.suffix == ".gif" else wandb.Image(str(file))
         run.log({"env_steps": env_steps, name: media}, step=self._state[str(seed)]["iteration"])

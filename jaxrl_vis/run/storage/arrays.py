@@ -26,12 +26,12 @@ def named_leaves(tree: Any) -> dict[str, Any]:
 
 
 def to_host(tree: Any, copy: bool) -> Arrays:
-    """Convert the leaves of a pytree to NumPy arrays by name; typed keys to their words.
+    """Convert the leaves of a pytree to NumPy arrays by name, and typed keys to their key data (uint32).
 
     Args:
         tree: Arrays on a device.
-        copy: Whether to copy. If not, arrays on a CPU are views of the device's memory: a view is valid only until the arrays
-            are donated, and while one exists, the next donation makes a copy.
+        copy: Whether to copy. If not, arrays on one CPU device with a dtype that NumPy has are views of the device's memory: a
+            view is valid only until the arrays are donated, and while one exists, the next donation makes a copy.
     """
 
     def convert(leaf: jax.Array) -> np.ndarray:
@@ -155,7 +155,7 @@ def rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
     def convert(path: Any, leaf: Any) -> jax.Array:
         array, sharding = arrays[jax.tree_util.keystr(path, simple=True, separator=".")], getattr(leaf, "sharding", None)
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            # The default key type, as in `Trainer.run_keys`; another type has another number of words, which is detected
+            # The default key type, as in `Trainer.run_keys`; another type has key data of another size, which is detected
             # earlier.
             array = jax.random.wrap_key_data(jnp.asarray(array))
         elif array.shape != leaf.shape:

@@ -154,7 +154,7 @@ class Checkpoints:
         self._save(LIGHT, iteration, {"train": saved_leaves(train, copy=True)}, progress)
 
     def save_best(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
-        """Write the learner, wait for the disk, then delete earlier best checkpoints. Otherwise as `save_light`."""
+        """Write the learner, wait for the disk, then delete earlier best checkpoints. Otherwise like `save_light`."""
         self._save(BEST, iteration, {"train": saved_leaves(train, copy=False)}, progress)
         self.wait()
         for earlier in self.iterations(BEST):
@@ -166,7 +166,7 @@ class Checkpoints:
     def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
         """Write the complete state and wait for the disk: an asynchronous copy of the replay would need memory for two.
 
-        Otherwise as `save_light`.
+        Otherwise like `save_light`.
         """
         items = {
             "train": saved_leaves(loop.train, copy=False),
@@ -335,7 +335,7 @@ class Checkpoints:
     def restore_train(self, template: LoopState, iteration: int | None = None) -> Restored | None:
         """Restore the learner of the newest valid light or full checkpoint, or of that of ``iteration``; None if there is none.
 
-        Otherwise as `restore_for_resume`.
+        Otherwise like `restore_for_resume`.
         """
         return self._newest_good(template, with_replay=False, requested=iteration)
 

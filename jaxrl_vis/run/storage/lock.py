@@ -84,7 +84,7 @@ class HeldLock:
         return False
 
     def current_path(self) -> Path | None:
-        """Return the folder's current path; None if it was deleted, or the system cannot tell."""
+        """Return the folder's current path; None if it was deleted, or the system does not report it."""
         if self._descriptor is None:
             return None
         with contextlib.suppress(OSError):
@@ -101,7 +101,7 @@ class HeldLock:
 
 @contextlib.contextmanager
 def run_lock(folder: Path, echo: Callable[[str], None] = print) -> Iterator[HeldLock]:
-    """Lock a run folder; create it if missing, and remove it again if it is still empty at the end.
+    """Lock a run folder and yield the lock. Create the folder if missing, and remove it if it is still empty at the end.
 
     Args:
         folder: The folder.
@@ -135,7 +135,7 @@ def _lock_by_system(path: Path, stack: contextlib.ExitStack) -> bool:
 
     Returns:
         True if this process holds the lock. False if the file must itself serve as the lock (`_lock_by_marker`): the file
-        system does not support locks, or another process has concluded so and already uses the file in this way.
+        system does not support locks, or another process has found that it does not and uses the file in this way.
 
     Raises:
         RequestError: Another process holds the lock.

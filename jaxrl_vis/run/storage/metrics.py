@@ -45,7 +45,7 @@ class RowKeys(NamedTuple):
     env_steps: int
 
 
-_NO_FIGURES = {*RowKeys._fields, RUN_ID} - {"updates"}
+_NOT_METRICS = {*RowKeys._fields, RUN_ID} - {"updates"}
 _MAX_VALUE = 2**63  # of a number in a row: the range of integer arrays
 _SHOWN = 8  # line numbers in a message
 
@@ -94,7 +94,7 @@ def make_rows(seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[s
 
 def scalars(row: Row) -> dict[str, float]:
     """Return the metrics of a row and its ``updates`` by name, without those that were not finite."""
-    return {name: float(value) for name, value in row.items() if name not in _NO_FIGURES and value is not None}
+    return {name: float(value) for name, value in row.items() if name not in _NOT_METRICS and value is not None}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,10 +168,10 @@ def _read_row(line: bytes) -> dict[str, Any] | None:
         return None
     if not isinstance(row.get(RUN_ID), str | None):
         return None
-    return row if all(name == RUN_ID or _is_figure(value) for name, value in row.items()) else None
+    return row if all(name == RUN_ID or _is_metric(value) for name, value in row.items()) else None
 
 
-def _is_figure(value: Any) -> bool:
+def _is_metric(value: Any) -> bool:
     if isinstance(value, int) and not isinstance(value, bool):
         return abs(value) < _MAX_VALUE
     return value is None or (isinstance(value, float) and math.isfinite(value))

@@ -62,7 +62,7 @@ class Session:
     def __init__(self, policy: Policy, seed: int = 0):
         env = policy.env
         if not isinstance(env, MjxGoalEnv):
-            raise RequestError(f"--live shows tasks on MJX, and {policy.env_name} is none: leave it out for a video")
+            raise RequestError(f"--live shows tasks on MJX, and {policy.env_name} is not one: leave it out for a video")
         self.env, self._policy, self._keys = env, policy, map(jax.random.key, itertools.count(seed))
 
         def begin(key: jax.Array) -> tuple[Any, Any]:
@@ -150,8 +150,8 @@ class Page:
                 np.asarray(session.observation)[None, None], np.asarray(session.goal)[None], np.zeros(1)
             )
             self._depth_range = videos.range_of_depth(first)
-            self._goal_image = gui.add_image(self._drawn(session.goal), label="Goal, as the robot sees it")
-            self._image = gui.add_image(self._drawn(session.observation), label="Now, as the robot sees it")
+            self._goal_image = gui.add_image(self._to_display(session.goal), label="Goal, as the robot sees it")
+            self._image = gui.add_image(self._to_display(session.observation), label="Now, as the robot sees it")
         self._status = gui.add_markdown("")
         if self._handle is not None:
             gui.add_markdown("Drag the arrows in the scene: the green robot is the goal.")
@@ -215,20 +215,20 @@ class Page:
             self._handle.position = np.asarray(session.state.goal_state, float)
         self._is_dragging = False
         if self._shows_images:
-            self._goal_image.image = self._drawn(session.goal)
+            self._goal_image.image = self._to_display(session.goal)
 
     def _show(self) -> None:
         session, env = self._session, self._session.env
         self._scene.show(*_poses(session.state.data))
         if self._shows_images:
-            self._image.image = self._drawn(session.observation)
+            self._image.image = self._to_display(session.observation)
         reached = session.distance <= env.threshold
         shown = (
             f"{100 * session.distance:.1f} cm" if env.distance_unit == "m" else f"{session.distance:.2f} {env.distance_unit}"
         )
         self._status.content = f"**{'Reached' if reached else 'On its way'}**: {shown} from the goal\n\n{self._note}"
 
-    def _drawn(self, image: Any) -> np.ndarray:
+    def _to_display(self, image: Any) -> np.ndarray:
         """Convert the newest image of an observation [C, H, W] for display, colours beside depth: [H', W', 3] uint8."""
         channels = np.shape(image)[0] // self._session.env.frame_stack
         rows = videos.image_rows(np.asarray(image)[:channels], self._depth_range)

@@ -46,7 +46,7 @@ class Results:
         self.draw_curve(done)
         if self._programs.shows_images:
             videos.write_video(videos.first_seed(recorded), self._folder.video, self._programs.image_seconds)
-            self._loggers.image("video", self._folder.video, self._env_steps(done))
+            self._loggers.log_image("video", self._folder.video, self._env_steps(done))
         rows = [row for row in self._folder.rows() if row["iteration"] == done and row.get("eval/success") is not None]
         success = ", ".join(f"seed {row['seed']}: {row['eval/success']:.3f}" for row in rows)
         written = [file.name for file in (self._folder.curve, self._folder.video) if file.exists()]
@@ -69,7 +69,7 @@ class Results:
             unit=env.distance_unit,
             threshold=env.threshold,
         )
-        self._loggers.image("curve", self._folder.curve, self._env_steps(done))
+        self._loggers.log_image("curve", self._folder.curve, self._env_steps(done))
 
     def _env_steps(self, done: int) -> int:
         return done * self._programs.program.steps_per_iteration

@@ -62,7 +62,7 @@ def format_list(values: Iterable[Any]) -> str:
     return ", ".join(words[:_SHOWN]) + (f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else "")
 
 
-def _is_figure(value: Any) -> bool:
+def _is_metric(value: Any) -> bool:
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value))
 
 
@@ -73,7 +73,7 @@ def _read_line(line: bytes) -> dict[str, Any] | str:
     except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
         return "is damaged"
     if not isinstance(row, dict) or not all(is_count(row.get(name)) for name in RowKeys._fields):
-        return f"is no row: {', '.join(RowKeys._fields)} must be numbers"
+        return f"is not a row: {', '.join(RowKeys._fields)} must be numbers"
     return row
 
 
@@ -113,7 +113,7 @@ def _fault(row: Mapping[str, Any], expected: RowConditions) -> str:
             return f"{name} is {row[name]}, not {iteration * per_iteration} as config.json implies for {iteration} iterations"
     if LOST in row and not (is_count(row[LOST]) and row[LOST] <= iteration):
         return f"{LOST} is {row[LOST]!r}, which does not fit iteration {iteration}"
-    wrong = [name for name, value in row.items() if name != RUN_ID and not _is_figure(value)]
+    wrong = [name for name, value in row.items() if name != RUN_ID and not _is_metric(value)]
     if wrong or "eval/success" not in row:
         return f"{', '.join(wrong)}: not a number" if wrong else "holds no evaluation"
     return ""

@@ -247,7 +247,7 @@ class _Verifier:
     # -- Repeating
 
     def _repeat_all(self, iterations: int | None) -> Repeater:
-        """Repeat the run from the seed, and from each full checkpoint."""
+        """Repeat the run from the seed and from each full checkpoint; return the repeater."""
         programs, seed = self._programs, Progress()
         repeater = Repeater(programs, self._expected, self._rows, self._manifests, self._report, self._echo)
         compared_iterations = self._plan(0, seed, iterations)

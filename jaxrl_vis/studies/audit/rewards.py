@@ -82,6 +82,6 @@ def find_reward(name: str, config: Config, trust: bool = False) -> Reward:
         raise RequestError(f"unknown reward {name!r}{nearest(name, BUILT_IN)} ({others})")
     plugin: Any = plugins.find_component("reward", name, {}, config.environment.env_folder)
     if not callable(plugin):
-        raise RequestError(f"{name} is no reward: it must be a function of images and goal images")
+        raise RequestError(f"{name} is not a reward: it must be a function of images and goal images")
     own: Any = plugin
     return own

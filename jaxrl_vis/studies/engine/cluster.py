@@ -53,7 +53,7 @@ class Training:
                 signal.signal(signal.SIGTERM, before)
 
     def checkpoint(self) -> Any:
-        """Stop the run before the job is ended and queued again; called by submitit."""
+        """Stop the run before the job is ended, and return the job to be queued again; called by submitit."""
         import submitit
 
         self._terminate_child()

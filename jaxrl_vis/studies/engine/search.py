@@ -81,7 +81,7 @@ def read_range(text: str) -> Range:
             raise RequestError(f"--vary {text}: name two values or more, or set it with --{name.replace('_', '-')}")
         return Range(name, words=words)
     if fields.unwrap(OPTIONS[name].hint)[0] not in (int, float) or fields.unwrap(OPTIONS[name].hint)[2]:
-        raise RequestError(f"--vary {text}: {name} is no number: list its values, NAME=VALUE,VALUE")
+        raise RequestError(f"--vary {text}: {name} is not a number: list its values, NAME=VALUE,VALUE")
     ends, _, scale = values.partition(",")
     low, high = (_read(name, word) for word in ends.split("..", 1))
     if scale not in ("", "log") or not low < high or (scale and low <= 0):
@@ -133,8 +133,8 @@ def run_search(
         True if all trials have ended.
 
     Raises:
-        RequestError: No option varies or one does twice, Optuna is missing, the folder holds another search, or see
-            `run_cells`.
+        RequestError: No option varies or one does twice, Optuna is missing, or the folder holds another search; see
+            also `run_cells`.
         KeyboardInterrupt, Terminated: A signal arrived; raised after all runs have saved.
     """
     if not request.ranges:
@@ -186,7 +186,7 @@ def _open(optuna: Any, request: Request) -> Any:
     except OSError as error:
         raise RequestError(f"cannot write to {request.runs} ({error.strerror or error}): choose another --runs") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise RequestError(f"{file} is no journal of a search: move it away, or choose another --runs") from error
+        raise RequestError(f"{file} is not a journal of a search: move it away, or choose another --runs") from error
     if earlier is not None and earlier != asked:
         names = [name for name in asked if not isinstance(earlier, dict) or earlier.get(name) != asked[name]]
         shown = ", ".join(names[:3]) or "its options"
@@ -227,7 +227,7 @@ class _Search:
             if left is not None and left <= 0:
                 return False
             failures = run_cells(list(cells.values()), request.runs, find_once, left, self._command, self._echo)
-            if not self._tell(cells, failures):
+            if not self._report_scores(cells, failures):
                 return False
 
     def _cells(self, batch: Mapping[int, Mapping[str, Any]]) -> dict[int, Cell]:
@@ -245,7 +245,7 @@ class _Search:
                 self._study.tell(number, state=self._state.FAIL)
         return cells
 
-    def _tell(self, cells: Mapping[int, Cell], failures: Sequence[str]) -> bool:
+    def _report_scores(self, cells: Mapping[int, Cell], failures: Sequence[str]) -> bool:
         """Report the scores of trials to Optuna; return False if one has not ended, because time is up."""
         for number, cell in cells.items():
             rows = finished_rows(cell, self._request.runs)

@@ -35,9 +35,9 @@ class Family:
         tasks: Environments of the subject.
         preset: Default preset of the runs.
         of_task: (preset, environment) -> fields of `Config` that differ from the preset.
-        longest: Preset -> environment -> maximum number of environment steps, for presets that need smaller budgets than the
+        max_steps: Preset -> environment -> maximum number of environment steps, for presets that need smaller budgets than the
             thesis.
-        quick: Changes of the preset ``cpu`` for `figure --quick`.
+        quick_changes: Changes of the preset ``cpu`` for `figure --quick`.
     """
 
     name: str
@@ -45,8 +45,8 @@ class Family:
     tasks: tuple[str, ...]
     preset: str
     of_task: Mapping[tuple[str, str], Mapping[str, Any]]
-    longest: Mapping[str, Mapping[str, int]]
-    quick: Mapping[str, Any]
+    max_steps: Mapping[str, Mapping[str, int]]
+    quick_changes: Mapping[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,18 +58,18 @@ class Study:
         title: Title of the figure.
         variants: Names of its lines in the order of the legend, from `Family.variants`.
         steps: Environment -> environment steps of each run; these are the default tasks of the figure.
-        shorter: (environment, variant) -> environment steps of shorter runs.
-        extra: Variants that are trained for the tables only.
-        others: Environment -> environment steps of optional tasks.
+        shorter_steps: (environment, variant) -> environment steps of shorter runs.
+        extra_variants: Variants that are trained for the tables only.
+        optional_steps: Environment -> environment steps of optional tasks.
     """
 
     family: Family
     title: str
     variants: tuple[str, ...]
     steps: Mapping[str, int]
-    shorter: Mapping[tuple[str, str], int] = dataclasses.field(default_factory=dict)
-    extra: tuple[str, ...] = ()
-    others: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    shorter_steps: Mapping[tuple[str, str], int] = dataclasses.field(default_factory=dict)
+    extra_variants: tuple[str, ...] = ()
+    optional_steps: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,7 +137,7 @@ def _cells(study: Study, task: str, variant: str, scope: Scope) -> list[Cell]:
 def _budget(study: Study, task: str, variant: str, scope: Scope, config: Config) -> int:
     if scope.env_steps is not None:
         return scope.env_steps
-    steps = study.shorter.get((task, variant), {**study.others, **study.steps}.get(task, _DEFAULT_BUDGET))
+    steps = study.shorter_steps.get((task, variant), {**study.optional_steps, **study.steps}.get(task, _DEFAULT_BUDGET))
     if scope.preset == study.family.preset:
         return steps
-    return min(steps, study.family.longest.get(scope.preset, {}).get(task, config.run.env_steps))
+    return min(steps, study.family.max_steps.get(scope.preset, {}).get(task, config.run.env_steps))

@@ -4,7 +4,7 @@ FIGURE.png   lines of finished cells; in figures 5.4, 5.5 and 5.7 also those rel
 FIGURE.md    tables, and a description of the runs
 FIGURE.csv   the same numbers, for further processing
 
-`ol_aux`, `indicator`, `goals` and `weightings` define the runs of a figure; files in this folder their presentation.
+`ol_aux`, `indicator`, `goals` and `weightings` define the runs of a figure; files in this folder define how it looks.
 """
 
 from collections.abc import Callable, Sequence
@@ -46,7 +46,7 @@ def make_figure(request: Request, echo: Callable[[str], None] = streams.echo) ->
     """
     study = request.study
     tasks, variants = request.tasks or tuple(study.steps), request.variants or study.variants
-    extra = tuple(name for name in study.extra if name not in variants)
+    extra = tuple(name for name in study.extra_variants if name not in variants)
     cells = make_cells(study, tasks, (*extra, *variants), request.scope)
     if not request.draw_only:
         # A cell requested by several figures or methods is trained once.

@@ -92,7 +92,7 @@ def prepare(
 
 
 def encode(patches: jax.Array, weights: Weights, selection: slice = slice(None), interpret: bool = False) -> jax.Array:
-    """Encode the selected images by `apply`: [B, patches, 64 C'] -> [images, patches, F], same dtype; ``interpret`` as there.
+    """Encode the selected images by `apply`: [B, patches, 64 C'] -> [images, patches, F], same dtype.
 
     Images are selected here rather than sliced beforehand, because passing a slice to a kernel would copy it.
     """

@@ -1,6 +1,6 @@
 """Kernel that computes the encoder's first layers and their tangents along a direction of the weights.
 
-Has an equivalent in plain JAX, as in `kernels.passes`. Used by weightings that need dot products of gradients
+It has an equivalent in plain JAX, as in `kernels.passes`, and is used by weightings that need dot products of gradients
 (`networks.forward_mode`).
 """
 
