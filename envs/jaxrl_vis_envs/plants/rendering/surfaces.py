@@ -16,7 +16,7 @@ GROUND = -2
 NOTHING = -1
 """Label where nothing is within the rendered depth."""
 OBJECT = -(1 << 20)
-"""Label of round objects that are no stalks, such as poles and ears."""
+"""Label of round objects that are not stalks, such as poles and ears."""
 LITTER = -3
 """Label of litter and flat objects; that of the leaves of stalk n is `LITTER` - 1 - n."""
 
@@ -190,7 +190,7 @@ def _material(
 
 
 def _ground_by_day(rng: np.random.Generator, scene: Scene, soil: list[float]) -> list[float]:
-    """Sample the material of a ground by day: grass, or soil or concrete of any brightness; indoors, a smooth floor."""
+    """Sample the ground's material in a daytime plot: grass, or soil or concrete of any brightness; indoors, a smooth floor."""
     place = soil[-2]
     if scene.grass:
         hue, saturation, value = rng.uniform(0.18, 0.3), rng.uniform(0.4, 0.8), rng.uniform(0.08, 0.3)

@@ -1,9 +1,9 @@
 """GPU kernel in which rays walk bounding volume hierarchies (Pallas with Triton), see `hierarchies`.
 
 One program has one warp, and several times as many rays as lanes. Every lane traverses on its own the objects that its ray may
-meet, in the order of their bits, and waits for no other lane to finish an object: a step is some nodes, then the triangles of a
-leaf for the lanes that have reached one. A lane that has finished its ray takes the next one. The same code runs as plain JAX,
-with arrays in the place of memory blocks.
+meet, in the order of their bits, and waits for no other lane to finish an object: a step visits some nodes, then the triangles
+of a leaf for the lanes that have reached one. A lane that has finished its ray takes the next one. The same code runs as plain
+JAX, with arrays in the place of memory blocks.
 """
 
 import functools

@@ -115,7 +115,7 @@ def check_names(mj_model: mujoco.MjModel, leave_out: tuple[str, ...]) -> None:
 def object_types(mj_model: mujoco.MjModel) -> np.ndarray:
     """Return the `mujoco.mjtGeom` [ngeom + nsite + ntendon] of objects as rendered.
 
-    A signed distance field is MuJoCo's mesh of it, a tendon consists of capsules.
+    A signed distance field is rendered as MuJoCo's mesh of it, a tendon as capsules.
     """
     types = np.concatenate([mj_model.geom_type, mj_model.site_type, np.full(mj_model.ntendon, _CAPSULE)])
     return np.where(types == _SDF, _MESH, types)

@@ -132,7 +132,7 @@ def _shadow_mask(
 ) -> jax.Array:
     """Return 0 where a geom or tendon occludes the light, else 1: [P] float32. Sites cast no shadow.
 
-    The triangles of meshes are omitted where the light brightens none of the ``corners``, with or without them.
+    The triangles of meshes are omitted where the light brightens none of the ``corners`` anyway.
     """
     assert unit is not None
     to_light, distance, _ = lighting.light_vector(light, hit.point)

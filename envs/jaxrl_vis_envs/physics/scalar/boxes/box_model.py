@@ -1,4 +1,4 @@
-"""Constants of models whose contacts are those of boxes, one of them free, and which of these models the engine supports.
+"""Constants of models whose contacts are between boxes, one of them free, and the test of which models are supported.
 
 The contacts of all pairs, four of each, are spread over the 32 lanes of a warp. A constant of a contact is a number if it is
 the same in all lanes, or else the index of a row of a table with a column per lane.
