@@ -102,7 +102,7 @@ def _train(options: DetectorTraining) -> int:
 def _start(options: DetectorTraining, by_day: bool) -> tuple[Any, "Settings", str]:
     """Return the initial parameters (None for random ones), settings of the networks, and a phrase for the origin.
 
-    By day, networks detect sections: nothing in an image of an unknown camera shows where the band is.
+    For daytime plots, networks detect sections: nothing in an image of an unknown camera shows where the band is.
     """
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights

@@ -1,6 +1,6 @@
 """From grasp points to attempts: planning of stops and approaches, their simulation, and the results.
 
-The robot stops where it took its pairs, and knows these positions from its stitches. `choice` chooses the stop and approach for
+The robot stops where it took its pairs, and its stitches give these positions. `choice` chooses the stop and approach for
 each grasp point. The ground truth is used only to score what the jaws hold, and what they could have held.
 
 open    open loop: the arm moves to the grasp point as perceived, without looking again

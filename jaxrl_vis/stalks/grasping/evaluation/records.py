@@ -127,7 +127,7 @@ def summarize(records: Sequence[Record]) -> dict[str, Any]:
     """Summarize the records of runs, as values for JSON.
 
     Returns:
-        The figures of `summarize_scores`, ``devices`` and ``workers`` of the records, and under ``reaches`` the scores of those
+        The metrics of `summarize_scores`, ``devices`` and ``workers`` of the records, and under ``reaches`` the scores of those
         `Reaches` that all records hold, by name.
     """
     figures: dict[str, Any] = summarize_scores([read_score(record) for record in records])

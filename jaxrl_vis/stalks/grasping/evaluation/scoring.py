@@ -3,7 +3,7 @@
 row -> five pairs -> perception -> grasp points         as `run` does, without files
     -> true stalks, poses and masks                     from the row itself
 
-Only stalks count that at the preferred height stand within the 0.5 m that the robot drives along. A grasp point hits the stalk
+Stalks count if they stand within the 0.5 m that the robot drives along, at the preferred height. A grasp point hits the stalk
 that it is matched with, one to one, if it lies within 30 mm of that stalk's centre at its own height.
 """
 

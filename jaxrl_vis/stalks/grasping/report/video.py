@@ -100,7 +100,7 @@ def _outcome_caption(time: float, held_stalks: set[int], is_alone: bool) -> str:
 
 
 def _add_caption(frame: np.ndarray, left: str, right: str, colour: tuple[int, int, int]) -> Image.Image:
-    """Return the frame below a header with two captions; the right one has ``colour`` if it says what is held."""
+    """Return the frame below a header with two captions; the right one has ``colour`` if it states what is held."""
     canvas = Image.new("RGB", (frame.shape[1], frame.shape[0] + _HEADER), BACKGROUND)
     canvas.paste(Image.fromarray(frame), (0, _HEADER))
     draw = ImageDraw.Draw(canvas)

@@ -26,8 +26,8 @@ def synthetic_edges(
 ) -> Edges:
     """Compute the edges of the visible stalks of an image; those with fewer than 12 pixels after resizing are dropped.
 
-    By day, stalks of the rows of plants behind look like those of the near row: they are ``UNCLEAR``. At night, they are
-    background, as the light of the flash falls off.
+    In daytime plots, stalks of the rows of plants behind look like those of the near row: they are ``UNCLEAR``. At night,
+    they are background, as the light of the flash falls off.
 
     Args:
         plot: Plot with its plants.

@@ -130,7 +130,7 @@ def crop_randomly(example: Example, max_size: tuple[int, int], rng: np.random.Ge
         rng: Generator of the position.
 
     Returns:
-        Example with clipped stalks, of which those that are hardly left in the image are ``NOTHING``.
+        Example with clipped stalks; those that are hardly left in the image become ``NOTHING``.
     """
     size = example.image.shape[:2]
     lines, columns = (min(length, limit) for length, limit in zip(size, max_size))

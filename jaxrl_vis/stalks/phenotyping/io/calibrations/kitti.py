@@ -27,7 +27,7 @@ def read_kitti(text: str, path: Path, image: Path | None) -> RectifiedPair:
     Args:
         text: Contents of the file.
         path: The file, for messages.
-        image: A left image, whose parent folders tell which pair it belongs to; None if unknown.
+        image: A left image, whose parent folders identify its pair; None if unknown.
 
     Raises:
         RequestError: The pair is missing or ambiguous, or a matrix or size is invalid.
