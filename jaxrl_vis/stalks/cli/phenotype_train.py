@@ -99,7 +99,7 @@ def _train(options: DetectorTraining) -> int:
     return 0
 
 
-def _start(options: DetectorTraining, by_day: bool) -> tuple[Any, "Settings", str]:
+def _start(options: DetectorTraining, is_daytime: bool) -> tuple[Any, "Settings", str]:
     """Return the initial parameters (None for random ones), settings of the networks, and a phrase for the origin.
 
     For daytime plots, networks detect sections: nothing in an image of an unknown camera shows where the band is.
@@ -110,9 +110,9 @@ def _start(options: DetectorTraining, by_day: bool) -> tuple[Any, "Settings", st
 
     start = options.start or "random"
     if start == "random":
-        return None, Settings().for_sections() if by_day else Settings(), ""
+        return None, Settings().for_sections() if is_daytime else Settings(), ""
     params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
-    if by_day and not settings.section:
+    if is_daytime and not settings.section:
         params, settings = start_sections(params, settings, options.seed)
         print(f"{start}: {BAND_WEIGHTS}", flush=True)
     # The number of candidates is not tied to the weights: training adapts the head to new ones.

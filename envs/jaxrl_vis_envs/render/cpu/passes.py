@@ -207,7 +207,7 @@ class _Colouring:
 
         normal = tiles.once(busy, make_pass(all_rows, self._normal), tile.normal)
         texture: jax.Array | None = None
-        if self.scene.atlas.used or self.scene.atlas.sky is not None:
+        if self.scene.atlas.has_textures or self.scene.atlas.sky is not None:
             texture = tiles.once(~busy, make_pass(planes, self._texture), tile.texture)
             texture = tiles.once(busy, make_pass(all_rows, self._texture), texture)
         of_mesh = () if mesh is None else (mesh.owner, mesh.colour)

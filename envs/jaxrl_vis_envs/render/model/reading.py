@@ -29,7 +29,7 @@ LIGHTS = ("all", "mujoco")
 
 def body_masses(mj_model: mujoco.MjModel, mounts: Iterable[Mount]) -> tuple[np.ndarray, tuple[int, ...]]:
     """Return masses (kg) and parents of the bodies if any mount follows a centre of mass, else an empty array and tuple."""
-    if all(mount.weighed < 0 for mount in mounts):
+    if all(mount.weighed_body < 0 for mount in mounts):
         return np.zeros(0), ()
     return mj_model.body_mass, tuple(mj_model.body_parentid.tolist())
 

@@ -188,7 +188,7 @@ def reachable_from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray
         [B] bool.
     """
     masts = (stops + [0.0, MAST_DISTANCE, 0.0]) * [1.0, 1.0, 0.0]
-    return np.asarray(approach.reachable(masts[:, None], points[None]).any(axis=0))
+    return np.asarray(approach.is_within_reach(masts[:, None], points[None]).any(axis=0))
 
 
 def _true_stalks(plot: Plot, origins: np.ndarray, number: int) -> tuple[TrueStalk, ...]:

@@ -221,8 +221,8 @@ def _parse_table(path: Path, text: str) -> _Table:
     places = next((names for names in (*_POSITIONS, *_GLOBE) if set(names[:2]) <= set(columns)), None)
     left = next((columns.index(name) for name in _LEFT if name in columns), None)
     if not metres and time is None and places is None:
-        said = next((name for name in columns if name in ("distance", "dist", "odometer")), None)
-        hint = f" (its column {said} does not say its unit)" if said else ""
+        unitless_column = next((name for name in columns if name in ("distance", "dist", "odometer")), None)
+        hint = f" (its column {unitless_column} does not say its unit)" if unitless_column else ""
         raise RequestError(f"{path} needs a column distance_m, or time_s and --speed{hint}")
 
     def column(index: int) -> np.ndarray:
