@@ -110,7 +110,7 @@ class MjxGoalEnv(GoalEnv):
         Raises:
             NotImplementedError: The goals of this task are not points in space.
         """
-        raise NotImplementedError(f"goals of {type(self).__name__} are no points in space")
+        raise NotImplementedError(f"goals of {type(self).__name__} are not points in space")
 
     @abc.abstractmethod
     def observe_state(self, data: mjx.Data) -> jax.Array:

@@ -46,7 +46,7 @@ def train(options: DetectorTraining) -> int:
             "--workers, which are for synthetic ones"
         )
     if options.label and options.data is None:
-        raise RequestError("--label goes with --data: synthetic plots say themselves what is a stalk")
+        raise RequestError("--label goes with --data: synthetic plots have their own labels")
     check_extra("phenotyping")
     check_writable(options.out, "OUT")
     if options.data is not None:

@@ -38,7 +38,7 @@ def read_kitti(text: str, path: Path, image: Path | None) -> RectifiedPair:
         try:
             values = parse_numbers(rest)
         except ValueError as error:
-            raise RequestError(f"{path}: {name}{number} holds something that is no number") from error
+            raise RequestError(f"{path}: {name}{number} holds something that is not a number") from error
         if name == "S_rect_0":
             sizes[int(number)] = check_image_size((values + [0.0, 0.0])[:2], path, f"{name}{number}")
         elif len(values) != 12:

@@ -82,5 +82,5 @@ def _unit(store: dict[str, Any], path: Path) -> Unit | None:
     for unit in get_args(Unit):
         if stated_unit == unit:
             return unit
-    unit_read = reprlib.repr(stated_unit) if isinstance(stated_unit, str) else "something that is no text"
+    unit_read = reprlib.repr(stated_unit) if isinstance(stated_unit, str) else "something that is not text"
     raise RequestError(f"{path}: unit must be m, cm or mm, not {unit_read}")

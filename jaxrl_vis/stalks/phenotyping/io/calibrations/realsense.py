@@ -47,7 +47,7 @@ def read_table(store: dict[str, Any], path: Path, size: Size | None) -> Rectifie
     focal, x, y = modes[size]
     baseline = _number(store["baseline"])
     if baseline is None:
-        raise RequestError(f"{path} is of a RealSense camera, but its baseline is no number")
+        raise RequestError(f"{path} is of a RealSense camera, but its baseline is not a number")
     return RectifiedPair(projection_matrix(focal, x, y), projection_matrix(focal, x, y, -focal * abs(baseline)), size, "mm")
 
 

@@ -60,7 +60,7 @@ def read_settings(text: str, path: Path, size: Size | None) -> UnrectifiedPair:
         raise
     except (configparser.Error, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())[:100]
-        raise RequestError(f"{path} is of a ZED camera, but something of it is missing or no number ({reason})") from error
+        raise RequestError(f"{path} is of a ZED camera, but one of its values is missing or not a number ({reason})") from error
     if not all(map(math.isfinite, values)) or max(map(abs, values)) > 1e9:
         raise RequestError(f"{path} is of a ZED camera, but not all of its numbers are finite")
     rotation = cv2.Rodrigues(np.array(turns))[0]
