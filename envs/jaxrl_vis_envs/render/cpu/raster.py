@@ -96,7 +96,7 @@ def can_search(scene: Scene) -> bool:
 
 
 def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> blocks.Nearest:
-    """Return the nearest opaque objects of all pixels, as `blocks.nearest`. Not differentiable.
+    """Return the nearest opaque objects of all pixels, as `blocks.nearest` does. Not differentiable.
 
     Args:
         scene: Scene with triangles.
@@ -121,7 +121,8 @@ def nearest_triangle(
         layout: Order of the pixels.
 
     Returns:
-        As `triangles.nearest_triangle`, [blocks, P] each. The lowest bits of the depths are those of `triangles.NUMBER`.
+        The results of `triangles.nearest_triangle`, [blocks, P] each. The lowest bits of the depths (`triangles.NUMBER`) hold
+        the triangle's index in its cluster.
     """
     leaves = [field.name for field in dataclasses.fields(scene) if not field.metadata.get("static")]
     tables = {name: getattr(scene, name) for name in _TABLES}

@@ -46,7 +46,7 @@ def layout(scene: Scene) -> blocks.Layout:
 
 
 def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays, interpret: bool = False) -> blocks.Nearest:
-    """Return the nearest opaque objects of all pixels, as `blocks.nearest`. Not differentiable.
+    """Return the nearest opaque objects of all pixels, as `blocks.nearest` does. Not differentiable.
 
     Args:
         scene: Scene with triangles.

@@ -157,7 +157,7 @@ def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Ar
 
 
 def in_plain_jax(refs: Refs, any_hit: bool) -> list[jax.Array]:
-    """Traverse the hierarchies as `by_kernel`, along all rays at once. Rays of one call should be few, and coherent."""
+    """Traverse the hierarchies as `by_kernel` does, along all rays at once. Rays of one call should be few, and coherent."""
     return _walk(refs, jnp.arange(refs.nearest.shape[0], dtype=jnp.int32), any_hit)
 
 

@@ -65,7 +65,7 @@ class Plan:
             across the row, m; NaN where the pair does not show the stalk.
         stands: True stalks around the arm at the stop of each attempt.
         standing: True stalks of the stretch that the run passes.
-        detected: Detected stalks around the arm, laid out as `stands`; None unless planned for a policy, or without targets.
+        detected: Detected stalks around the arm, laid out like `stands`; None unless planned for a policy, or without targets.
     """
 
     run: int
