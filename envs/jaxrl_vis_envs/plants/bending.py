@@ -263,10 +263,8 @@ def _properties(radius: Any, segment: int | None, xp: Any) -> tuple[Any, Any, An
 
 def _segments(stalk_shapes: StalkShapes) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return lower segments (m), upward unit vectors and upper segments (m), as vectors [N, 3] from bottom to top."""
-    lower_axis, upper_axis = (
-        jnp.asarray(stalk_shapes.knee - stalk_shapes.foot),
-        jnp.asarray(stalk_shapes.top - stalk_shapes.knee),
-    )
+    foot, knee, top = stalk_shapes.foot, stalk_shapes.knee, stalk_shapes.top
+    lower_axis, upper_axis = jnp.asarray(knee - foot), jnp.asarray(top - knee)
     return lower_axis, jnp.zeros_like(lower_axis).at[:, 2].set(1.0), upper_axis
 
 
