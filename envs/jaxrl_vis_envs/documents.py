@@ -100,7 +100,7 @@ def parse_xml(text: str | bytes) -> ElementTree.Element:
     """Parse XML and return the root element.
 
     Raises:
-        ValueError: It is not XML, is nested deeper than `MAX_DEPTH`, or declares a document type, as any with entities does.
+        ValueError: It is not XML, is nested deeper than `MAX_DEPTH`, or declares a document type, which entities require.
     """
     parser = ElementTree.XMLParser(target=_Builder())
     try:

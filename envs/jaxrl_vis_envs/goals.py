@@ -109,5 +109,5 @@ def mark_object(image: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def object_mask(image: jax.Array) -> jax.Array:
-    """Read the mask that `mark_object` wrote, of a stack the newest image's: [..., C, H, W] uint8 -> [..., 1, H, W] bool."""
+    """Read the mask of `mark_object` from an image or a stack's newest one: [..., C, H, W] uint8 -> [..., 1, H, W] bool."""
     return (image[..., :1, :, :] & 1).astype(bool)

@@ -104,7 +104,7 @@ def has_images(name: str) -> bool:
 
 
 def state_variant(name: str) -> str | None:
-    """Return the environment with the same physics that observes the state, without building it.
+    """Return the name of the environment with the same physics that observes the state, without building it.
 
     Returns:
         ``name`` itself if it observes the state; None if there is no such variant.
@@ -120,7 +120,7 @@ def state_variant(name: str) -> str | None:
 
 
 def visual_variant(name: str) -> str | None:
-    """Return the environment with the same physics that observes images, without building it; None if there is none.
+    """Return the name of the environment with the same physics that observes images, without building it; None if none.
 
     Raises:
         UnknownEnvironmentError: There is no such environment.
@@ -230,7 +230,7 @@ def _entry(name: str, folder: str | None = None) -> _Entry:
 
 
 def _module_entry(name: str, module: ModuleType, task: str) -> _Entry:
-    """Return the environment ``task`` of a module: registered by the module under that name, or else its class.
+    """Return the entry of ``task`` in a module: the one that it registered under that name, or else one for its class.
 
     Raises:
         UnknownEnvironmentError: There is none, or it is not a complete environment.

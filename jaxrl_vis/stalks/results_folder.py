@@ -1,6 +1,6 @@
 """Results folder of a resumable command: its request, and records that are valid while their sources are unchanged.
 
-OUT/run.json    the request, of which a folder holds the results of only one
+OUT/run.json    the request; a folder holds the results of only one
 records         JSON files, each with the state of its source files
 """
 

@@ -28,5 +28,5 @@ def test_goals_are_drawn_from_the_box_and_placed_in_it(name: str, far: float) ->
 def test_tasks_whose_goals_are_no_points_have_no_box() -> None:
     env = jaxrl_vis_envs.make("Reacher")
     assert env.goal_box is None
-    with pytest.raises(NotImplementedError, match="goals of Reacher are no points in space"):
+    with pytest.raises(NotImplementedError, match="goals of Reacher are not points in space"):
         env.goal_configuration(jnp.zeros(3))

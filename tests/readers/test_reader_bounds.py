@@ -189,7 +189,7 @@ def test_a_file_that_is_larger_than_its_pixels_is_not_read(tmp_path):
     with pytest.raises(OSError, match="a.png is larger than 20 x 12 pixels can be"):
         image_size(path)
     os.mkfifo(tmp_path / "pipe.png")
-    with pytest.raises(OSError, match="is no ordinary file"):
+    with pytest.raises(OSError, match="is not a regular file"):
         read_image(tmp_path / "pipe.png")
 
 
@@ -255,7 +255,7 @@ def test_annotations_of_pascal_voc_that_are_none(worker, text, part):
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ('{"shapes": [], "imagePath": "a.png", "imageWidth": 1e400, "imageHeight": 5}', "no annotation of LabelMe"),
+        ('{"shapes": [], "imagePath": "a.png", "imageWidth": 1e400, "imageHeight": 5}', "not an annotation of LabelMe"),
         ('{"shapes": ' + "[" * 100_000, "nested more than 100 levels deep"),
         ('{"shapes": [], "imagePath": "..", "imageWidth": 5, "imageHeight": 5}', "annotates nothing"),
     ],

@@ -67,16 +67,16 @@ def test_rows_of_odometry_are_those_of_pairs(tmp_path):
     "table, told",
     [
         ("", "needs a column distance_m, or time_s and --speed"),
-        ("left,distance\nleft_0.png,1\n", "its column distance does not say its unit"),
+        ("left,distance\nleft_0.png,1\n", "its column distance does not state its unit"),
         ("time_s\n1608946479573159936\n1608946479673159936\n", "name the column time_ns"),
-        ("distance_m\n1\n\n,\nfar\n", "no number in line 5 ('far')"),
-        ("left;distance_m\nleft_0.png;1,2,3\n", "no number in line 2 ('1,2,3')"),
+        ("distance_m\n1\n\n,\nfar\n", "not a number in line 5 ('far')"),
+        ("left;distance_m\nleft_0.png;1,2,3\n", "not a number in line 2 ('1,2,3')"),
         ("left,metres\nleft_0.png,1\n", "needs a column distance_m, or time_s and --speed"),
         ("distance_m\n1\n", "has 1 rows for 2 pairs, so nobody can tell which is which"),
         ("distance_m\n1\n2\n3\n", "has 3 rows for 2 pairs, so nobody can tell which is which"),
-        ("distance_m\n1\nfar\n", "holds something that is no number"),
-        ("left,distance_m\nleft_0.png\n", "holds something that is no number"),
-        ("distance_m\n" + "1" * 200_000, "is no table: save it as CSV in UTF-8"),
+        ("distance_m\n1\nfar\n", "holds something that is not a number"),
+        ("left,distance_m\nleft_0.png\n", "holds something that is not a number"),
+        ("distance_m\n" + "1" * 200_000, "is not a table: save it as CSV in UTF-8"),
     ],
 )
 def test_odometry_that_cannot_be_used_is_told(tmp_path, table, told):

@@ -299,14 +299,14 @@ def test_files_of_several_forms_are_read_together(tmp_path):
         ({"r.xml": voc("r.png"), "r.json": labelme("r.png")}, ["r.png"], "r.png is annotated twice, in"),
         ({"r.xml": voc("r.png")}, ["a/r.png", "b/r.png"], "which may be a/r.png or b/r.png"),
         ({"annotations.xml": "<annotations><track/></annotations>"}, [], "tracks of a video"),
-        ({"r.txt": "1 0.5 0.5 0.1\n"}, ["r.png"], "is no annotation of YOLO"),
-        ({"r.txt": "1 0.5 0.5 0.1 7\n"}, ["r.png"], "what is no share of an image"),
+        ({"r.txt": "1 0.5 0.5 0.1\n"}, ["r.png"], "is not an annotation of YOLO"),
+        ({"r.txt": "1 0.5 0.5 0.1 7\n"}, ["r.png"], "that is not a fraction of an image"),
         ({"r.txt": "1 0.5 0.5 0.1 0.1 0.1 0.1 0.1\n"}, ["r.png"], "line 1 has 7 numbers"),
         ({"data.yaml": "kpt_shape: [3, 2]\nnames: [a]\n", "r.txt": yolo()}, ["r.png"], "of key points"),
         ({"r.json": '{"shapes": [{"label": "stalk", "points": [[0, 0], [5, 5]], "shape_type": "mask", "mask": "$$"}], '
           '"imagePath": "r.png", "imageWidth": 9, "imageHeight": 9}'}, ["r.png"], "a mask that is not base64"),
-        ({"r.json": '[1, 2]'}, ["r.png"], "is no annotation of LabelMe"),
-        ({"r.xml": "<opencv_storage/>"}, ["r.png"], "is no annotation of Pascal VOC, but called as an image is"),
+        ({"r.json": '[1, 2]'}, ["r.png"], "is not an annotation of LabelMe"),
+        ({"r.xml": "<opencv_storage/>"}, ["r.png"], "is not an annotation of Pascal VOC, but has the name of an image"),
         ({"notes.txt": "hello", "plot.json": "{}"}, ["r.png"], "(plot.json is none): put annotations.json of COCO there"),
     ],
 )  # fmt: skip

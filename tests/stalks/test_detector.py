@@ -432,11 +432,11 @@ def test_annotations_of_voc_and_labelme_are_those_of_coco(tmp_path):
     with pytest.raises(RequestError, match="there are no annotations in"):
         read_annotations(tmp_path / "empty")
     (tmp_path / "voc" / "row.xml").write_text("<annotation>")
-    with pytest.raises(RequestError, match="row.xml is no annotation of Pascal VOC"):
+    with pytest.raises(RequestError, match="row.xml is not an annotation of Pascal VOC"):
         read_annotations(tmp_path / "voc")
     (tmp_path / "labelme" / "row.json").write_text("{}")
     (tmp_path / "labelme" / "row.png").touch()  # without it, any other file may be called so
-    with pytest.raises(RequestError, match="row.json is no annotation of LabelMe"):
+    with pytest.raises(RequestError, match="row.json is not an annotation of LabelMe"):
         read_annotations(tmp_path / "labelme")
 
 

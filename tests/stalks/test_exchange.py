@@ -167,7 +167,7 @@ def test_ranges_and_rows_name_plots(tmp_path):
         ("plot_id,genotype\nx,A\ny,B\n", "its plot_id has x, y, and the folders are field 1/plot_0001"),
         ("plot_id,genotype,genotype\n1,A,B\n", "must name columns, each once"),
         ("", "must name columns"),
-        ("plot_id,genotype\nplot_0001,A\nplot_0001,B\nplot_0002,B\n", "two things of genotype of plot field 1/plot_0001: A"),
+        ("plot_id,genotype\nplot_0001,A\nplot_0001,B\nplot_0002,B\n", "two values of genotype for plot field 1/plot_0001: A"),
     ],
 )  # fmt: skip
 def test_plans_that_cannot_be_joined_are_told_in_one_line(tmp_path, text, part):

@@ -113,7 +113,7 @@ def test_the_model_has_the_dimensions_that_the_formulas_have():
 )
 def test_what_can_be_reached_is_what_the_geometry_allows(place: tuple[float, float, float], can: bool):
     rail = stand_origin(1.7)
-    assert bool(approach.reachable(rail, rail + np.array(place))) is can
+    assert bool(approach.is_within_reach(rail, rail + np.array(place))) is can
 
 
 def test_the_way_is_a_straight_line_out_of_the_shoulder():
@@ -196,8 +196,8 @@ def test_a_stalk_gives_way_like_a_beam():
     """Its stiffness at several heights z, in C MuJoCo, agrees with 3 EI / z^3 of a beam without taper."""
     arms, radius = build_arm_model(4), 0.006
     model = arms.mj_model.__copy__()
-    shape = jax.tree.map(lambda part: part[0], bending.shapes(stands()))
-    fitted = bending.set_stalk_properties(arms.model, arms.layout, shape)
+    stalk_shapes = jax.tree.map(lambda part: part[0], bending.shapes(stands()))
+    fitted = bending.set_stalk_properties(arms.model, arms.layout, stalk_shapes)
     for name in ("body_pos", "body_ipos", "body_mass", "body_inertia", "jnt_stiffness", "dof_damping"):
         getattr(model, name)[:] = getattr(fitted, name)
     rigidity = bending.MODULUS * np.pi * radius**4 / 4

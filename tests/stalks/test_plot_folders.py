@@ -279,5 +279,5 @@ def test_cells_that_are_not_numbers_are_reported_with_their_line(tmp_path, numbe
     if number == "1_0":
         assert read_odometry(plot(tmp_path)) == {"left0000": 0.0, "left0001": 10.0}
         return
-    with pytest.raises(RequestError, match="no number in line 4"):
+    with pytest.raises(RequestError, match="not a number in line 4"):
         read_odometry(plot(tmp_path))

@@ -92,11 +92,11 @@ def test_odometry_by_distance_time_and_name(tmp_path):
     assert read_odometry(plot) is None
     assert read_odometry(plot, speed=0.05) == {"0": 0.05, "1": pytest.approx(0.15)}
     for text, part in (
-        ("distance_m\n1\nnan\n", "no number"),
-        ("distance_m\nx\n", "no number"),
+        ("distance_m\n1\nnan\n", "not a number"),
+        ("distance_m\nx\n", "not a number"),
         ("metres\n1\n", "needs a column"),
         ("distance_m\n1\n", "1 rows for 2 pairs"),
-        ("distance_m\n" + "9" * 200_000 + "\n", "is no table"),
+        ("distance_m\n" + "9" * 200_000 + "\n", "is not a table"),
     ):
         table.write_text(text)
         with pytest.raises(RequestError, match=part):

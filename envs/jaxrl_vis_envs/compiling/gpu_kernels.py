@@ -1,4 +1,4 @@
-"""Pallas kernels (Triton) for NVIDIA GPUs, including cards that are missing in JAX's list.
+"""Pallas kernels (Triton) for NVIDIA GPUs, including cards that are missing from JAX's list.
 
 JAX 0.11 lowers a kernel only if the GPU's name is in a list of some twenty, from which it reads the compute capability. A
 GeForce RTX 3090 or an L40S is missing. Kernels for such a card are lowered under the name of a listed card of the same or the
@@ -30,7 +30,7 @@ _substitutes: dict[str, str | None] = {}
 
 
 def kernel_call(kernel: Callable[..., None], *, interpret: bool = False, **options: Any) -> Callable[..., Any]:
-    """Wrap `jax.experimental.pallas.pallas_call`, with support for cards that are missing in JAX's list.
+    """Wrap `jax.experimental.pallas.pallas_call`, with support for cards that are missing from JAX's list.
 
     Args:
         kernel: Function of input and output references.

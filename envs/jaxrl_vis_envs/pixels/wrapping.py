@@ -55,8 +55,9 @@ def wrap(
             there are no goal images.
         frames: Number of most recent images of each kind in an observation, stacked along the channels, newest last. One image
             shows positions, several show velocities. A reset repeats its image. Goals have one image.
-        layout: ``dict``: the own observation (as ``state``, if it is an array) and the images ``pixels/CAMERA`` (colours),
-            ``pixels/CAMERA/OUTPUT`` and, for goals, ``.../goal``. ``images``: only the images. ``image``: one array [H, W, C].
+        layout: ``dict``: the environment's own observation (as ``state``, if it is an array) and the images ``pixels/CAMERA``
+            (colours), ``pixels/CAMERA/OUTPUT`` and, for goals, ``.../goal``. ``images``: only the images. ``image``: one array
+            [H, W, C].
         dtype: ``float32`` (colours from 0 to 1, as brax's agents expect them) or ``uint8``. If None, uint8 for Gymnasium, else
             float32.
         depth_range: Depths (m) encoded as 0 and 1, or as 0 and 255 for uint8. If None, depths are in m, float32.

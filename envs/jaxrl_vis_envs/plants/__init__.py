@@ -2,7 +2,7 @@
 
     family      parameters of the fields and their variation: TRAINING
     shifts      families with shifted factors: SHIFTED, `shift`     spec    a family from a file: `read`
-    scene       factors of plots by day    settling   values of these factors sampled for one plot
+    scene       factors of daytime plots   settling   values of these factors sampled for one plot
     clutter     objects around the plants                   structures tripods, scaffolds, hoses, trees, jointed arms
     organs      ears, tassels, panicles, clasping leaves    rendering  from a plot to the pixels of an image
     field       one plot: stalks and leaves in metres       cameras    trajectory of a camera pair past it

@@ -118,7 +118,7 @@ def read_layout(mj_model: mujoco.MjModel) -> Layout:
     )
 
 
-class Shape(NamedTuple):
+class StalkShapes(NamedTuple):
     """N stalks of one stand, as in `Stands`.
 
     Attributes:
@@ -133,17 +133,17 @@ class Shape(NamedTuple):
     bending_radius: Any
 
 
-def shapes(stands: Stands) -> Shape:
+def shapes(stands: Stands) -> StalkShapes:
     """Return the shapes of all stands, each array with a leading axis [B]."""
-    return Shape(stands.foot, stands.knee, stands.top, stands.radius, stands.bending_radius)
+    return StalkShapes(stands.foot, stands.knee, stands.top, stands.radius, stands.bending_radius)
 
 
-def set_stalk_properties(model: Any, layout: Layout, shape: Shape) -> Any:
-    """Return ``model`` (an `mjx.Model`) with the lengths, radii, masses, stiffness and damping of the stalks in ``shape``.
+def set_stalk_properties(model: Any, layout: Layout, stalk_shapes: StalkShapes) -> Any:
+    """Return ``model`` (an `mjx.Model`) with the lengths, radii, masses, stiffness and damping of stalks of these shapes.
 
     `place_stands` sets the positions of the feet and the directions of the lower segments. Stalks must have knees.
     """
-    lower_axis, up, upper_axis = _segments(shape)
+    lower_axis, up, upper_axis = _segments(stalk_shapes)
     lengths = jnp.stack([jnp.linalg.norm(lower_axis, axis=-1), jnp.linalg.norm(upper_axis, axis=-1)], axis=-1)
     from_lower = jax.vmap(rotations.quat_inv)(_shortest_rotation(up, lower_axis))
     rotation = _shortest_rotation(up, jax.vmap(rotations.rotate)(upper_axis, from_lower))
@@ -155,8 +155,8 @@ def set_stalk_properties(model: Any, layout: Layout, shape: Shape) -> Any:
     changes["body_pos"] = changes["body_pos"].at[layout.upper].set(_upward(lengths[:, 0]))
     changes["body_quat"] = changes["body_quat"].at[layout.upper].set(rotation)
     for part in (0, 1):
-        radius, length = shape.radius[:, part], lengths[:, part]
-        stiffness, damping, mass, inertia = _properties(shape.bending_radius[:, part], part, jnp)
+        radius, length = stalk_shapes.radius[:, part], lengths[:, part]
+        stiffness, damping, mass, inertia = _properties(stalk_shapes.bending_radius[:, part], part, jnp)
         around = jnp.stack([inertia, inertia, mass * radius**2], axis=-1)
         size = jnp.stack([radius, length / 2, jnp.zeros_like(radius)], axis=-1)
         for name, index, value in (
@@ -172,11 +172,11 @@ def set_stalk_properties(model: Any, layout: Layout, shape: Shape) -> Any:
     return model.replace(**changes)
 
 
-def place_stands(data: Any, layout: Layout, shape: Shape) -> Any:
+def place_stands(data: Any, layout: Layout, stalk_shapes: StalkShapes) -> Any:
     """Return ``data`` (an `mjx.Data`) with the feet of the stalks at their positions and the lower segments aligned."""
-    lower_axis, up, _ = _segments(shape)
+    lower_axis, up, _ = _segments(stalk_shapes)
     return data.replace(
-        mocap_pos=data.mocap_pos.at[layout.mocap].set(jnp.asarray(shape.foot, jnp.float32)),
+        mocap_pos=data.mocap_pos.at[layout.mocap].set(jnp.asarray(stalk_shapes.foot, jnp.float32)),
         mocap_quat=data.mocap_quat.at[layout.mocap].set(_shortest_rotation(up, lower_axis)),
     )
 
@@ -261,9 +261,10 @@ def _properties(radius: Any, segment: int | None, xp: Any) -> tuple[Any, Any, An
     return stiffness, 2 * _DAMPING_RATIO * xp.sqrt(stiffness * swung), mass, inertia
 
 
-def _segments(shape: Shape) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _segments(stalk_shapes: StalkShapes) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return lower segments (m), upward unit vectors and upper segments (m), as vectors [N, 3] from bottom to top."""
-    lower_axis, upper_axis = jnp.asarray(shape.knee - shape.foot), jnp.asarray(shape.top - shape.knee)
+    foot, knee, top = stalk_shapes.foot, stalk_shapes.knee, stalk_shapes.top
+    lower_axis, upper_axis = jnp.asarray(knee - foot), jnp.asarray(top - knee)
     return lower_axis, jnp.zeros_like(lower_axis).at[:, 2].set(1.0), upper_axis
 
 

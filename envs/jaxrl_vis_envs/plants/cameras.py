@@ -130,7 +130,7 @@ def drive(family: Family, seed: int) -> Drive:
 
 
 def _rotate_pose(pose: Pose, scene: Scene, signs: np.ndarray, distance: float) -> Pose:
-    """Turn a camera about the vertical through the point of the row that it looks at, and roll it about its view."""
+    """Turn a camera about the vertical through the point of the row that it looks at, and roll it about its optical axis."""
     yaw, roll = (math.radians(sign * angle) for sign, angle in zip(signs, (scene.yaw[0], scene.roll[0])))
     about = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     pivot = pose.position + np.array([0.0, distance, 0.0])

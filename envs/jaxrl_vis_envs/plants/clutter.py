@@ -14,7 +14,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Leaf, list[float]]]]:
-    """Sample the objects of a plot by day, determined by its family and seed.
+    """Sample the objects of a daytime plot, determined by its family and seed.
 
     Returns:
         Round objects as chains of truncated cones (`Stalk`), and flat ones as ribbons (`Leaf`), each with its material

@@ -320,7 +320,7 @@ class Family:
     imaging: Imaging = Imaging()
     """Light and sensor."""
     scene: Scene = Scene()
-    """Daylight, surroundings and cameras of plots by day."""
+    """Daylight, surroundings and cameras of daytime plots."""
 
     def __post_init__(self) -> None:
         _check_value("stream", 1, self.stream)

@@ -97,7 +97,7 @@ class Plot:
     """Contents of a plot, and of the rows behind it.
 
     Attributes:
-        family: Family that it was sampled from, after `settle`: for plots by day, with the values sampled for this plot.
+        family: Family that it was sampled from, after `settle`: for daytime plots, with the values sampled for this plot.
         seed: Seed of the sample.
         stalks: Stalks, those of the near row first, sorted by position.
         leaves: All leaves and the litter.

@@ -1,4 +1,7 @@
-"""Organs of plants by day other than plain leaves: ears, tassels and panicles, clasping and hanging leaves. NumPy only."""
+"""Plant organs other than plain leaves, in daytime plots: ears, tassels, panicles, and clasping and hanging leaves.
+
+NumPy only.
+"""
 
 import colorsys
 import math
@@ -14,7 +17,7 @@ _PANICLE_PROFILE = np.array([0.3, 0.8, 1.0, 0.9, 0.65, 0.25])
 
 
 def sample_organs(plot: Plot) -> tuple[list[Tube], list[Leaf]]:
-    """Sample the organs of the plants of a plot by day.
+    """Sample the organs of the plants of a daytime plot.
 
     Returns:
         Round organs: ears and tassels of maize, panicles of sorghum; and leaves of the near row: bases of leaves that clasp a

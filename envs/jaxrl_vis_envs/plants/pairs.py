@@ -27,7 +27,7 @@ _MOWN = 0.25
 
 @functools.lru_cache(maxsize=2)
 def daylight(family: Family, seed: int) -> shading.Day | None:
-    """Sample the daylight and the backdrop of a plot from its settled family; None at night. The last two are cached."""
+    """Sample the daylight and the backdrop of a plot from its settled family; None at night. Two results are cached."""
     scene = family.scene
     if scene.share <= 0:
         return None
@@ -170,7 +170,7 @@ class Sequence:
         return jnp.asarray(values), jnp.where(jnp.asarray(shown), instance, NOTHING), depth
 
     def _add_surroundings(self, images: tuple[jax.Array, ...], camera: tuple, day: shading.Day) -> tuple[jax.Array, ...]:
-        """Add panels, blades of grass and lens flare to the radiance, instance and depth images of a camera by day."""
+        """Add panels, blades of grass and lens flare to the radiance, instance and depth images of a camera in daylight."""
         family, seed = self.plot.family, self.plot.seed
         radiance, instance, depth = map(np.asarray, images)
         walls = panels(family, seed)

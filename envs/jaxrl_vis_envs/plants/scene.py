@@ -1,4 +1,4 @@
-"""Factors of plots by day: daylight, surroundings and cameras. Imports neither JAX nor MuJoCo."""
+"""Factors of daytime plots: daylight, surroundings and cameras. Imports neither JAX nor MuJoCo."""
 
 import dataclasses
 
@@ -7,21 +7,21 @@ Range = tuple[float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Daylight, surroundings and cameras of plots by day, which are not photographed with a flash at night.
+    """Daylight, surroundings and cameras of daytime plots; all other plots are photographed at night, with a flash.
 
     With the default ``share`` of 0, all plots are at night and the other fields have no effect.
     """
 
     share: float = 0.0
-    """Fraction of plots by day, to which all other fields apply."""
+    """Fraction of plots that are daytime plots, to which all other fields apply."""
     maize: float = 0.4
-    """Fraction of plots by day that look like maize: thick green stalks, broad leaves."""
+    """Fraction of daytime plots that look like maize: thick green stalks, broad leaves."""
     potted: float = 0.3
-    """Fraction of plots by day with a few potted plants instead of rows."""
+    """Fraction of daytime plots with a few potted plants instead of rows."""
     indoors: float = 0.15
-    """Fraction of plots by day that are indoors, in front of a wall and under a ceiling, without sun."""
+    """Fraction of daytime plots that are indoors, in front of a wall and under a ceiling, without sun."""
     photographs: float = 0.0
-    """Fraction of plots by day whose background is a photograph shipped with scikit-image or scikit-learn."""
+    """Fraction of daytime plots whose background is a photograph shipped with scikit-image or scikit-learn."""
     sun: Range = (0.0, 1.6)
     """Sunlight on a white surface that faces the sun, relative to the flash at the row."""
     sky: Range = (0.15, 0.7)
@@ -31,7 +31,7 @@ class Scene:
     shadow: Range = (0.0, 1.0)
     """Fraction of the sunlight that is blocked in the shadows of the leaves above."""
     grass: float = 0.4
-    """Fraction of plots by day whose ground is grass; the others have soil or concrete."""
+    """Fraction of daytime plots whose ground is grass; the others have soil or concrete."""
     straw: Range = (0.0, 3.0)
     """Factor of the number of pieces of dry leaf on the ground."""
     distance: Range = (0.4, 1.6)
@@ -49,7 +49,7 @@ class Scene:
     objects: Range = (0.0, 5.0)
     """Mean number of objects other than plants per metre of row: poles, tubes, strips, blades, cables, legs."""
     robot: float = 0.25
-    """Fraction of plots by day with parts of a robot in view."""
+    """Fraction of daytime plots with parts of a robot in view."""
     brightness: Range = (0.12, 0.45)
     """Target mean brightness of the auto exposure; 1 is white."""
     white_balance: float = 0.1
@@ -63,11 +63,11 @@ class Scene:
     borders: float = 0.2
     """Fraction of images with black bars or wedges at their sides."""
     single: float = 0.25
-    """Fraction of plots by day with one whole plant, from the pot or the ground to its top, instead of rows."""
+    """Fraction of daytime plots with one whole plant, from the pot or the ground to its top, instead of rows."""
     portrait: float = 0.35
-    """Fraction of plots by day whose images are upright; the longer side keeps the view of the lens."""
+    """Fraction of daytime plots whose images are upright; the longer side keeps the view of the lens."""
     lone: float = 0.3
-    """Fraction of plots by day without rows behind the near one."""
+    """Fraction of daytime plots without rows behind the near one."""
     walls: Range = (0.0, 1.6)
     """Mean number of walls and fences behind the row or, at times, in front of it: sheets, planks, pickets, wire, windows."""
     structures: Range = (0.0, 2.5)
@@ -79,7 +79,7 @@ class Scene:
     glare: Range = (-1.5, 1.5)
     """Exposure of the sky behind the plants relative to its light, stops."""
     flare: float = 0.1
-    """Fraction of plots by day with lens flare, which veils the image."""
+    """Fraction of daytime plots with lens flare, which veils the image."""
     overlay: float = 0.12
     """Fraction of images with thin lines, rectangles or text drawn over them in pure colours."""
     replicated: float = 0.1

@@ -1,4 +1,4 @@
-"""Sampling of the factors that are common to one plot, for families with plots by day and by night. NumPy only."""
+"""Sampling of the factors that are common to one plot, for families with daytime and night plots. NumPy only."""
 
 import dataclasses
 import math
@@ -25,12 +25,12 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
     """Sample the factors that are common to a plot: night or day, maize or sorghum, pots or rows, camera poses and light.
 
     Args:
-        family: Family to sample from; returned unchanged if it has no plots by day.
+        family: Family to sample from; returned unchanged if it has no daytime plots.
         rng: Random number generator.
 
     Returns:
-        By night, the family with the default scene, whose share is 0. By day, a family with a share of 1, one value in each
-        range of its scene and 0 or 1 for its fractions (those of images apart), and its other parts adapted to these.
+        At night, the family with the default scene, whose share is 0. In daytime, a family with a share of 1, one value in
+        each range of its scene and 0 or 1 for its fractions (those of images apart), and its other parts adapted to these.
     """
     if family.scene.share <= 0:
         return family
@@ -85,7 +85,7 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
 def _single(
     scene: Scene, layout: Layout, stalks: Stalks, leaves: Leaves, slope: float, rng: np.random.Generator
 ) -> tuple[Scene, Layout, Stalks, Leaves, float]:
-    """Sample a single plant and the distance (m) at which an image with half a view of tangent ``slope`` shows most of it."""
+    """Sample a single plant and the distance (m) at which an image shows most of it; ``slope``: tangent of half the view."""
     tall = rng.uniform(0.9, 2.3)
     # From a part of the plant to a plant that is small in its image.
     distance = float(np.clip(0.5 * tall / slope * rng.uniform(0.5, 1.6), 0.4, 4.0))

@@ -1,4 +1,4 @@
-"""Round structures that are no stalks: tripods, scaffolds, hoses, bare trees, trunks, jointed arms. NumPy only."""
+"""Round structures that are not stalks: tripods, scaffolds, hoses, bare trees, trunks, jointed arms. NumPy only."""
 
 import colorsys
 import math
@@ -14,10 +14,10 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 def tube(corners: list[np.ndarray], radius: float | np.ndarray, end: float | None = None) -> Stalk:
-    """Return a tube through corners [3], m.
+    """Return a tube through ``corners``.
 
     Args:
-        corners: K points on its axis, m.
+        corners: K points [3] on its axis, m.
         radius: Radius at the start, or [K] at each corner, m.
         end: Radius at the end, m, for a radius that changes linearly; None for a constant one.
     """
@@ -108,7 +108,7 @@ def _hose(rng: np.random.Generator, foot: np.ndarray) -> list[Tube]:
 
 
 def _bark(rng: np.random.Generator) -> list[float]:
-    """Sample the material of bark: rough along the trunk, with lichens, or with rings as of a cherry tree."""
+    """Sample the material of bark: rough along the trunk, with lichens, or with rings like those of a cherry tree."""
     colour = colorsys.hsv_to_rgb(rng.uniform(0.02, 0.12), rng.uniform(0.05, 0.5), rng.uniform(0.04, 0.35))
     over = colorsys.hsv_to_rgb(rng.uniform(0.1, 0.3), rng.uniform(0.05, 0.3), rng.uniform(0.2, 0.5))
     return [

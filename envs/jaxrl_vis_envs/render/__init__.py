@@ -9,7 +9,7 @@ Example::
 Modules, in the order in which data passes through them; each imports only from the rows above it::
 
     mounts       poses of cameras and lights, from the poses of bodies
-    model/       reads an `mujoco.MjModel` into NumPy arrays: colours, lights, lens, triangles, texture atlas, paths of tendons
+    model/       reads a `mujoco.MjModel` into NumPy arrays: colours, lights, lens, triangles, texture atlas, paths of tendons
     cords        poses of the capsules of tendons, from the poses of sites
     viewpoint    camera pose and lens, intrinsic matrix, points from depths
     scene        `Scene`, a pytree of all of the above; `outputs`: the requested and the returned planes

@@ -151,7 +151,7 @@ def _draw_along(path: _Path, outputs: Outputs, *arguments: Any) -> Planes:
 def _draw_fast(
     path: _Path, outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
 ) -> Planes:
-    """Render as `_draw`, by one GPU kernel or by passes on a CPU, with the derivatives of `_draw`."""
+    """Render as `_draw` does, by one GPU kernel or by passes on a CPU, with the derivatives of `_draw`."""
     assert path.fast is not None
     return path.fast(outputs, scene, rotation, unit, light_table)
 
@@ -165,14 +165,14 @@ def _differentiate(path: _Path, outputs: Outputs, primals: tuple, tangents: tupl
 def _draw_walking(
     outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
 ) -> Planes:
-    """Render as `_draw`, with the nearest objects found by GPU kernels."""
+    """Render as `_draw` does, with the nearest objects found by GPU kernels."""
     return _draw(outputs, scene, rotation, unit, light_table, _BY_KERNELS)
 
 
 def _draw_rasterized(
     outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
 ) -> Planes:
-    """Render as `_draw`, with the nearest triangles found by rasterisation."""
+    """Render as `_draw` does, with the nearest triangles found by rasterisation."""
     return _draw(outputs, scene, rotation, unit, light_table, _BY_PIXELS)
 
 

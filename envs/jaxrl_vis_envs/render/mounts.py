@@ -38,14 +38,14 @@ class Mount(NamedTuple):
         return self.target >= 0 and self.mode in (_MODES.mjCAMLIGHT_TARGETBODY, _MODES.mjCAMLIGHT_TARGETBODYCOM)
 
     @property
-    def posed(self) -> int:
+    def last_posed_body(self) -> int:
         """Highest index of the bodies whose poses are used; 0 if none, since the world does not move."""
         by_mass = self.mode == _MODES.mjCAMLIGHT_TRACKCOM
         target = self.target if self.aims and self.mode == _MODES.mjCAMLIGHT_TARGETBODY else _WORLD
         return max(_WORLD if by_mass else self.body, target)
 
     @property
-    def weighed(self) -> int:
+    def weighed_body(self) -> int:
         """Index of the body whose subtree's centre of mass is used; -1 if none."""
         if self.mode == _MODES.mjCAMLIGHT_TRACKCOM:
             return self.body

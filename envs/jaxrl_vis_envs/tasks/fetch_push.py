@@ -155,7 +155,7 @@ class FetchPush(FetchArm):
         return state.replace(metrics={**state.metrics, "moved": jnp.zeros(())})
 
     def advance(self, state: State, action: jax.Array) -> State:
-        """Advance as `GoalEnv.advance`; ``metrics["moved"]`` is 1 once the box has moved by over 1 mm in a control step."""
+        """Advance by one control step; ``metrics["moved"]`` is 1 once the box has moved by over 1 mm in a step."""
         after = super().advance(state, action)
         moves = jnp.linalg.norm(after.achieved_state - state.achieved_state) > _MOVE_THRESHOLD
         moved = jnp.maximum(state.metrics["moved"], moves.astype(jnp.float32))
@@ -223,7 +223,7 @@ class FetchPush(FetchArm):
 
 
 def _euler_angles(rotation: jax.Array) -> jax.Array:
-    """Convert a rotation matrix [3, 3] to angles [3] (rad) about x, y and z, as the original's ``mat2euler``."""
+    """Convert a rotation matrix [3, 3] to angles [3] (rad) about x, y and z, as the original's ``mat2euler`` does."""
     cosine = jnp.hypot(rotation[2, 2], rotation[1, 2])
     is_regular = cosine > 1e-6
     roll = jnp.where(is_regular, -jnp.arctan2(rotation[1, 2], rotation[2, 2]), 0.0)

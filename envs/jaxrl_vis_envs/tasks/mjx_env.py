@@ -101,7 +101,7 @@ class MjxGoalEnv(GoalEnv):
         """Return the true quantity that goals constrain, `State.achieved_state`: [G] float32."""
 
     def goal_state(self, key: jax.Array, goal_data: mjx.Data) -> jax.Array:
-        """Return the goal state [G] of ``reset(key)``, whose goal image shows ``goal_data``: by default, what that achieves."""
+        """Return the goal state [G] of ``reset(key)``, whose goal image shows ``goal_data``: by default, its achieved state."""
         return self.achieved(goal_data)
 
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
@@ -110,7 +110,7 @@ class MjxGoalEnv(GoalEnv):
         Raises:
             NotImplementedError: The goals of this task are not points in space.
         """
-        raise NotImplementedError(f"goals of {type(self).__name__} are no points in space")
+        raise NotImplementedError(f"goals of {type(self).__name__} are not points in space")
 
     @abc.abstractmethod
     def observe_state(self, data: mjx.Data) -> jax.Array:

@@ -64,13 +64,13 @@ def evaluate(options: Eval) -> int:
         weights = resolve_weights(options.weights)
         load_finder(weights, options.min_score)  # reports what is wrong with the weights
         name = detector_name(weights)
-    figures = _evaluate(options, _read_factors(options) if options.each_factor else {"": family}, weights, name)
+    summaries = _evaluate(options, _read_factors(options) if options.each_factor else {"": family}, weights, name)
     if options.each_factor:
-        _write_table(options, name, figures)
+        _write_table(options, name, summaries)
         return 0
     print(f"synthetic plots of family {family.name}, {name}, {options.method}:")
-    for figure, value in figures[""].items():
-        print(f"  {figure:24} {value if isinstance(value, int) else f'{value:.4f}'}")
+    for metric, value in summaries[""].items():
+        print(f"  {metric:24} {value if isinstance(value, int) else f'{value:.4f}'}")
     return 0
 
 
@@ -117,15 +117,15 @@ def _factor_file(path: Path | None, factor: str) -> Path | None:
 _COLUMNS = ("count_r2", "count_mae", "count_bias", "width_mae_mm", "width_bias_mm", "ap50", "f1")
 
 
-def _write_table(options: Eval, name: str, figures: Mapping[str, dict[str, Any]]) -> None:
-    """Print a Markdown table with one row per key of ``figures``, and write all figures to ``--json``, if given."""
+def _write_table(options: Eval, name: str, summaries: Mapping[str, dict[str, Any]]) -> None:
+    """Print a Markdown table with one row per key of ``summaries``, and write all of them to ``--json``, if given."""
     from jaxrl_vis.host.files import write_atomically
 
     if options.json is not None:
-        about = {"synthetic": True, "finder": name, "method": options.method, "factors": replace_non_finite(figures)}
+        about = {"synthetic": True, "finder": name, "method": options.method, "factors": replace_non_finite(summaries)}
         write_atomically(options.json, json.dumps(about, indent=2) + "\n")
     print(f"\nsynthetic plots, {options.plots} each, {name}, {options.method}\n")
     print("| shifted | " + " | ".join(_COLUMNS) + " |")
     print("|---|" + "---|" * len(_COLUMNS))
-    for factor, values in figures.items():
+    for factor, values in summaries.items():
         print(f"| {factor} | " + " | ".join(f"{values[column]:.3f}" for column in _COLUMNS) + " |")

@@ -40,7 +40,7 @@ def label(options: Label) -> int:
     from jaxrl_vis.stalks.phenotyping.report.proposals import write_coco, write_labelme
 
     if not options.images.is_dir():
-        raise RequestError(f"{options.images} is no folder: name the folder of the images")
+        raise RequestError(f"{options.images} is not a folder: name the folder of the images")
     check_writable(options.images, "IMAGES", folder=True)
     there = options.images / "annotations.json"
     if options.format == "coco" and there.exists():

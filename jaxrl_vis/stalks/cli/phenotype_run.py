@@ -78,9 +78,9 @@ def run(options: Run) -> int:
         print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
     calibrations = {plot.name: options.read_calibration(plot) for plot in plots}
     columns, plan = ([], {}) if options.field is None else read_field_plan(options.field, [plot.name for plot in plots])
-    said = None if options.field is None else missing_plots_message(plan, [plot.name for plot in plots])
-    if said is not None:
-        print(f"{options.field}: {said}", file=sys.stderr)
+    message = None if options.field is None else missing_plots_message(plan, [plot.name for plot in plots])
+    if message is not None:
+        print(f"{options.field}: {message}", file=sys.stderr)
     if options.workers > 1:
         share_accelerator()
     check_devices()

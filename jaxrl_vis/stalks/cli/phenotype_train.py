@@ -46,7 +46,7 @@ def train(options: DetectorTraining) -> int:
             "--workers, which are for synthetic ones"
         )
     if options.label and options.data is None:
-        raise RequestError("--label goes with --data: synthetic plots say themselves what is a stalk")
+        raise RequestError("--label goes with --data: synthetic plots have their own labels")
     check_extra("phenotyping")
     check_writable(options.out, "OUT")
     if options.data is not None:
@@ -99,10 +99,10 @@ def _train(options: DetectorTraining) -> int:
     return 0
 
 
-def _start(options: DetectorTraining, by_day: bool) -> tuple[Any, "Settings", str]:
+def _start(options: DetectorTraining, is_daytime: bool) -> tuple[Any, "Settings", str]:
     """Return the initial parameters (None for random ones), settings of the networks, and a phrase for the origin.
 
-    By day, networks detect sections: nothing in an image of an unknown camera shows where the band is.
+    For daytime plots, networks detect sections: nothing in an image of an unknown camera shows where the band is.
     """
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
@@ -110,9 +110,9 @@ def _start(options: DetectorTraining, by_day: bool) -> tuple[Any, "Settings", st
 
     start = options.start or "random"
     if start == "random":
-        return None, Settings().for_sections() if by_day else Settings(), ""
+        return None, Settings().for_sections() if is_daytime else Settings(), ""
     params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
-    if by_day and not settings.section:
+    if is_daytime and not settings.section:
         params, settings = start_sections(params, settings, options.seed)
         print(f"{start}: {BAND_WEIGHTS}", flush=True)
     # The number of candidates is not tied to the weights: training adapts the head to new ones.

@@ -1,4 +1,4 @@
-"""Contacts of two capsules, or of a plane and a sphere, in scalars (`partial_arithmetic`): closest points and Jacobians."""
+"""Contacts of two capsules, or of a plane and a sphere, in scalars (`partial_arithmetic`), and their Jacobians."""
 
 from typing import Any, NamedTuple
 
@@ -94,9 +94,9 @@ def common_ancestor(tree: list[Link], pairs: list[GeomPair]) -> int:
 
 
 def contact_point(pair: GeomPair, frames: LinkFrames) -> ContactPoint:
-    """Compute the closest points of two geoms, with the same arithmetic as `mjx_model.step`.
+    """Compute the contact of two geoms (distance, midpoint and normal) from their closest points.
 
-    Source: Ericson, "Real-Time Collision Detection", 5.1.9.
+    The arithmetic is that of `mjx_model.step`. Source: Ericson, "Real-Time Collision Detection", 5.1.9.
     """
     if pair.is_on_plane:
         return _plane_contact_point(pair, frames)
@@ -127,7 +127,7 @@ def contact_point(pair: GeomPair, frames: LinkFrames) -> ContactPoint:
 
 
 def _plane_contact_point(pair: GeomPair, frames: LinkFrames) -> ContactPoint:
-    """Compute the closest points of an infinite plane and a sphere."""
+    """Compute the contact of an infinite plane and a sphere (distance, midpoint and normal)."""
     plane, sphere = pair.frames
     normal, middle = frames.direction(plane.link, plane.rotation[:, 2]), frames.point(sphere.link, sphere.position)
     radius = pair.radii[1]

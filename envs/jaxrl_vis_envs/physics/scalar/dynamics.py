@@ -28,7 +28,7 @@ from jaxrl_vis_envs.physics.scalar.partial_arithmetic import (
     sine_and_cosine,
     symmetric_times,
     times,
-    upper,
+    upper_key,
 )
 
 
@@ -271,14 +271,14 @@ def _rotate_inertia(axis: int, joint: JointTransform, inertia: Symmetric) -> Sym
     """Rotate a symmetric matrix by a joint's angle."""
     one, other = (axis + 1) % 3, (axis + 2) % 3
     sine, cosine = joint.sine, joint.cosine
-    first, second, mixed = inertia[one, one], inertia[other, other], inertia[upper(one, other)]
-    left, right = inertia[upper(axis, one)], inertia[upper(axis, other)]
+    first, second, mixed = inertia[one, one], inertia[other, other], inertia[upper_key(one, other)]
+    left, right = inertia[upper_key(axis, one)], inertia[upper_key(axis, other)]
     tilt = plus(times(sine, minus(first, second)), times(2.0, cosine, mixed))
     return {
         (axis, axis): inertia[axis, axis],
         (one, one): minus(first, times(sine, tilt)),
         (other, other): plus(second, times(sine, tilt)),
-        upper(one, other): minus(times(cosine, tilt), mixed),
-        upper(axis, one): minus(times(cosine, left), times(sine, right)),
-        upper(axis, other): plus(times(sine, left), times(cosine, right)),
+        upper_key(one, other): minus(times(cosine, tilt), mixed),
+        upper_key(axis, one): minus(times(cosine, left), times(sine, right)),
+        upper_key(axis, other): plus(times(sine, left), times(cosine, right)),
     }

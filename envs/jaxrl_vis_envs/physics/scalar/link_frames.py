@@ -98,7 +98,7 @@ class LinkFrames:
         return ZERO if self._tree[joint].slides else self.joint_axis(joint)
 
     def derivative_along(self, joint: int, direction: Vector, moment: Vector) -> Any:
-        """Return the derivative of the position along a direction of a point moved by a joint, m/rad or m/m.
+        """Return the derivative of a point's position along a direction with respect to a joint that moves it, m/rad or m/m.
 
         Args:
             joint: Index of the joint.

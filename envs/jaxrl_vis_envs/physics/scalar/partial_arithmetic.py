@@ -109,14 +109,14 @@ def combine(columns: Sequence[Vector], weights: Sequence[Any]) -> Vector:
     return add(*(scale(column, weight) for column, weight in zip(columns, weights, strict=True)))
 
 
-def upper(row: int, column: int) -> tuple[int, int]:
-    """Return the key of a symmetric matrix's entry."""
+def upper_key(row: int, column: int) -> tuple[int, int]:
+    """Return the key of an entry in the upper triangle, by which a symmetric matrix stores it."""
     return (row, column) if row <= column else (column, row)
 
 
 def symmetric_times(matrix: Symmetric, vector: Vector) -> Vector:
     """Multiply a symmetric matrix by a vector."""
-    x, y, z = (plus(*(times(matrix[upper(row, column)], vector[column]) for column in range(3))) for row in range(3))
+    x, y, z = (plus(*(times(matrix[upper_key(row, column)], vector[column]) for column in range(3))) for row in range(3))
     return x, y, z
 
 

@@ -1,7 +1,7 @@
 """Physics steps in scalars: joint positions and velocities from one physics step to the next.
 
 As matrices, a step is a hundred operations that each take a GPU longer to start than to run; as scalars, all of them fit into
-one kernel (`steps_kernel`). Everything of the model is a constant (`scalar_model`).
+one kernel (`steps_kernel`). All properties of the model are constants (`scalar_model`).
 """
 
 from collections.abc import Sequence
@@ -59,7 +59,7 @@ class StepInputs(NamedTuple):
 
 
 class ConstraintRow(NamedTuple):
-    """Row of a `scalar_newton.Problem`: ``jacobian`` entries, and its fields; ``max_friction`` is None unless dry friction."""
+    """Row of a `scalar_newton.Problem`: ``jacobian`` entries and fields of that name; ``max_friction`` for dry friction."""
 
     entries: Row
     stiffness: Any

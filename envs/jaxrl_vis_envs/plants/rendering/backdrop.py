@@ -1,4 +1,4 @@
-"""Backdrops of plots by day, beyond the ground. NumPy and Pillow only.
+"""Backdrops of daytime plots, beyond the ground. NumPy and Pillow only.
 
 A backdrop is an image in azimuth and tangent of the elevation, infinitely far away, in the units of the renderer's radiance.
 """

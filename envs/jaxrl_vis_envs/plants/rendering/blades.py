@@ -1,4 +1,4 @@
-"""Blades of grass on the ground of plots by day: upright strips that resemble stalks. NumPy and Pillow only."""
+"""Blades of grass on the ground of daytime plots: upright strips that resemble stalks. NumPy and Pillow only."""
 
 import dataclasses
 

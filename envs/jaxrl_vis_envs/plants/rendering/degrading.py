@@ -1,4 +1,4 @@
-"""Effects of simple cameras on images by day: white balance, low resolution, motion blur, JPEG, borders, overlays.
+"""Effects of simple cameras on images of daytime plots: white balance, low resolution, motion blur, JPEG, borders, overlays.
 
 NumPy and Pillow only.
 """

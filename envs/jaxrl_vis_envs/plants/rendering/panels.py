@@ -32,7 +32,7 @@ class Panel:
 
 
 def sample_panels(rng: np.random.Generator, family: Family) -> list[Panel]:
-    """Sample the panels of a plot by day from its settled family: walls and fences, and indoors a room with furniture."""
+    """Sample the panels of a daytime plot from its settled family: walls and fences, and indoors a room with furniture."""
     scene, distance = family.scene, family.rig.distance
     middle = 0.5 * family.layout.plot_length
     detail = family.rig.focal / distance  # pixels per m at the row

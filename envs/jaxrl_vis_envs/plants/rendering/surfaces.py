@@ -16,7 +16,7 @@ GROUND = -2
 NOTHING = -1
 """Label where nothing is within the rendered depth."""
 OBJECT = -(1 << 20)
-"""Label of round objects that are no stalks, such as poles and ears."""
+"""Label of round objects that are not stalks, such as poles and ears."""
 LITTER = -3
 """Label of litter and flat objects; that of the leaves of stalk n is `LITTER` - 1 - n."""
 
@@ -72,21 +72,21 @@ def build_surfaces(plot: Plot) -> Surfaces:
     rng = generator(plot.family, plot.seed, "textures")
     textures = plot.family.textures
     materials = [_ground(rng, textures)]
-    by_day = plot.family.scene.share > 0
-    if by_day:
-        materials = [_ground_by_day(rng, plot.family.scene, materials[0])]
+    is_daytime = plot.family.scene.share > 0
+    if is_daytime:
+        materials = [_daytime_ground(rng, plot.family.scene, materials[0])]
     cones = []
     for index, stalk in enumerate(plot.stalks):
         cones.append(_cones(index, stalk, len(materials)))
         materials.append(_material(rng, textures, textures.stalk_hue, textures.dry_hue, (0.35, 0.7), (0.30, 0.5)))
-    organs, clasping = sample_organs(plot) if by_day else ([], [])
+    organs, clasping = sample_organs(plot) if is_daytime else ([], [])
     strips = []
     for leaf in (*plot.leaves, *clasping):
         strips.append(_triangles(leaf, len(materials)))
         hue = textures.dry_hue if leaf.dry else textures.leaf_hue
         saturation, value = ((0.35, 0.6), (0.14, 0.34)) if leaf.dry else ((0.5, 0.75), (0.09, 0.19))
         materials.append(_material(rng, textures, hue, textures.dry_hue, saturation, value))
-    if by_day:
+    if is_daytime:
         round_things, flat_things = objects(plot)
         for tube, paint in [*round_things, *organs]:
             cones.append(_cones(OBJECT, tube, len(materials)))
@@ -189,8 +189,8 @@ def _material(
     ]
 
 
-def _ground_by_day(rng: np.random.Generator, scene: Scene, soil: list[float]) -> list[float]:
-    """Sample the material of a ground by day: grass, or soil or concrete of any brightness; indoors, a smooth floor."""
+def _daytime_ground(rng: np.random.Generator, scene: Scene, soil: list[float]) -> list[float]:
+    """Sample the ground's material in a daytime plot: grass, or soil or concrete of any brightness; indoors, a smooth floor."""
     place = soil[-2]
     if scene.grass:
         hue, saturation, value = rng.uniform(0.18, 0.3), rng.uniform(0.4, 0.8), rng.uniform(0.08, 0.3)

@@ -1,4 +1,4 @@
-"""Pictures of walls and fences, of which many have upright stripes: reflectance and opacity. NumPy and Pillow only."""
+"""Pictures of walls and fences, many of them with upright stripes: reflectance and opacity. NumPy and Pillow only."""
 
 import colorsys
 import math

@@ -207,7 +207,7 @@ class _Colouring:
 
         normal = tiles.once(busy, make_pass(all_rows, self._normal), tile.normal)
         texture: jax.Array | None = None
-        if self.scene.atlas.used or self.scene.atlas.sky is not None:
+        if self.scene.atlas.has_textures or self.scene.atlas.sky is not None:
             texture = tiles.once(~busy, make_pass(planes, self._texture), tile.texture)
             texture = tiles.once(busy, make_pass(all_rows, self._texture), texture)
         of_mesh = () if mesh is None else (mesh.owner, mesh.colour)
@@ -283,7 +283,11 @@ class _Colouring:
 
 
 def _select_row(table: jax.Array, rows: list[int], index: jax.Array) -> lookup.Row:
-    """Select each pixel's object as `lookup.fetch`. Few ``rows`` are selected by comparisons, since XLA would store lookups."""
+    """Return the table row of the object at each pixel, as `lookup.fetch` does.
+
+    Up to `_MAX_SELECTED` candidate ``rows`` are compared instead of looked up, since XLA would write the result of a lookup to
+    memory.
+    """
     if len(rows) > _MAX_SELECTED:
         return lookup.fetch(table, index)
     first, *others = rows or [0]

@@ -4,7 +4,7 @@ Most triangles of a fine mesh lie between the middles of pixels, or face away fr
 selected by their bounds, then single triangles by theirs, and the pairs of a triangle and a pixel that remain are tested as in
 the plain renderer: some thousand pairs in an image of 64x64, where testing blocks of pixels takes millions.
 
-How many there are differs between images. Those of some images are therefore listed one after another, and processed in chunks
+Images differ in their number of pairs. Those of several images are therefore listed one after another, and processed in chunks
 of a fixed size, so that no image waits for another one, and the arrays of a chunk stay in the cache.
 """
 
@@ -56,7 +56,7 @@ class _ImageBatch(NamedTuple):
     Attributes:
         scene: Scene with the leaves in `_TABLES` only.
         ends: [G * K] int32, cumulative number of clusters that may be visible.
-        axes, origin: Of the objects of all images, one after another, see `UnitShapes`.
+        axes, origin: Those of the objects of all images, one after another, see `UnitShapes`.
         lens: [G, 5] float32: the column is the first number times u plus the third, and the row the second times v plus the
             fourth; the fifth is the depth of the near plane, m.
         rays: [G * P].
@@ -96,7 +96,7 @@ def can_search(scene: Scene) -> bool:
 
 
 def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> blocks.Nearest:
-    """Return the nearest opaque objects of all pixels, as `blocks.nearest`. Not differentiable.
+    """Return the nearest opaque objects of all pixels, as `blocks.nearest` does. Not differentiable.
 
     Args:
         scene: Scene with triangles.
@@ -121,7 +121,8 @@ def nearest_triangle(
         layout: Order of the pixels.
 
     Returns:
-        As `triangles.nearest_triangle`, [blocks, P] each. The lowest bits of the depths are those of `triangles.NUMBER`.
+        The results of `triangles.nearest_triangle`, [blocks, P] each. The lowest bits of the depths (`triangles.NUMBER`) hold
+        the triangle's index in its cluster.
     """
     leaves = [field.name for field in dataclasses.fields(scene) if not field.metadata.get("static")]
     tables = {name: getattr(scene, name) for name in _TABLES}

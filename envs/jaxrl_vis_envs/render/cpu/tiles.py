@@ -113,7 +113,7 @@ def keys_of_objects(
     sky: jax.Array,
     mask: int,
 ) -> tuple[jax.Array, ...]:
-    """Compute the keys [P] int32 of each of some objects in one tile; any value unless it is ``visible`` there.
+    """Compute the keys of some objects in one tile, [P] int32 each; arbitrary for objects that are not ``visible`` there.
 
     Args:
         scene: The scene.

@@ -20,7 +20,7 @@ from jaxrl_vis_envs.compiling.compilation import use_gpu_kernels
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
-from jaxrl_vis_envs.render.gpu.tiles import PIXELS, rectangles, tile_shape, tile_words
+from jaxrl_vis_envs.render.gpu.tiles import PIXELS_PER_TILE, rectangles, tile_shape, tile_words
 from jaxrl_vis_envs.render.model import reading
 from jaxrl_vis_envs.render.outputs import Outputs, Planes
 from jaxrl_vis_envs.render.pixel import lights, lookup, raycast, shade, shapes, surface
@@ -59,7 +59,7 @@ def can_render(scene: Scene, outputs: Outputs) -> bool:
 def supports(scene: Scene) -> bool:
     """Return True if the kernel supports this scene, on any platform: opaque primitives without shadows or haze."""
     is_simple = not any(scene.transparent) and not any(scene.light_shadows) and scene.haze[0] < 0
-    textured = scene.atlas.used or scene.atlas.sky is not None
+    textured = scene.atlas.has_textures or scene.atlas.sky is not None
     # The kernel computes the texture footprint of a pixel, and does not support lenses with a sensor.
     return is_simple and not (textured and scene.projection == "intrinsic") and set(scene.object_types) <= _TYPES
 
@@ -123,7 +123,7 @@ def _nearest(scene: Scene, refs: _Refs, tile_index: Any, rays: Rays, znear: Any,
 
 
 class _Tile(NamedTuple):
-    """Pixels of a tile, [PIXELS] each, of which some may lie beyond the image, and what is nearest there.
+    """Pixels of a tile, [PIXELS_PER_TILE] each, of which some may lie beyond the image, and what is nearest there.
 
     Attributes:
         row: Row of the pixel.
@@ -148,7 +148,7 @@ def _search_tile(refs: _Refs, scene: Scene, tile: tuple[int, int]) -> _Tile:
     across = np.int32(-(-scene.width // wide))
     tile_index = pl.program_id(0)
     top, left = jax.lax.div(tile_index, across) * high, jax.lax.rem(tile_index, across) * wide
-    lane = jax.lax.broadcasted_iota(jnp.int32, (PIXELS,), 0)
+    lane = jax.lax.broadcasted_iota(jnp.int32, (PIXELS_PER_TILE,), 0)
     row, column = top + jax.lax.div(lane, jnp.int32(wide)), left + jax.lax.rem(lane, jnp.int32(wide))
     inside = (lane < high * wide) & (row < scene.height) & (column < scene.width)
 
@@ -159,10 +159,10 @@ def _search_tile(refs: _Refs, scene: Scene, tile: tuple[int, int]) -> _Tile:
     rays = Rays(u, v)
 
     mask = raycast.code_mask(scene)
-    sky = jnp.broadcast_to((jax.lax.bitcast_convert_type(zfar, jnp.int32) & ~mask) | mask, (PIXELS,))
+    sky = jnp.broadcast_to((jax.lax.bitcast_convert_type(zfar, jnp.int32) & ~mask) | mask, (PIXELS_PER_TILE,))
     best: tuple = (sky,)
     if raycast.has_separate_rows(scene):
-        best = (sky, jnp.full((PIXELS,), len(scene.object_ids), jnp.int32))
+        best = (sky, jnp.full((PIXELS_PER_TILE,), len(scene.object_ids), jnp.int32))
     best = _nearest(scene, refs, tile_index, rays, znear, best)
     return _Tile(row, column, inside, rays, zfar, best)
 
@@ -188,7 +188,7 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     top_colour, bottom_colour = ([refs.view[index] for index in colour] for colour in (_SKY_TOP, _SKY_BOTTOM))
     texels: Any = _BlockTexels(refs.texels, refs.levels)
     inner = scene.replace(sky_top=top_colour, sky_bottom=bottom_colour, zfar=zfar, fovy=refs.view[_FOVY], texels=texels)
-    zero = jnp.zeros((PIXELS,), jnp.float32)
+    zero = jnp.zeros((PIXELS_PER_TILE,), jnp.float32)
     far, normal, colour = zero, (zero,) * 3, (zero,) * 3
     if outputs.rgb or outputs.depth or outputs.normals or outputs.distance:
 

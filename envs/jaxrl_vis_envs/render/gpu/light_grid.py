@@ -46,7 +46,7 @@ def shadow_cells(light: Light, segments: Segments, middle: jax.Array, radius: ja
         radius: [N] float32, m, their radii.
     """
     centre = tuple(middle[:, axis] for axis in range(3))
-    if light.directional:
+    if light.is_directional:
         frame = _frame(tuple(-light.direction[axis] for axis in range(3)))
         place = [dot(segments.start, axis) for axis in frame]
         bounds = [(at - radius, at + radius) for at in (dot(centre, axis) for axis in frame)]

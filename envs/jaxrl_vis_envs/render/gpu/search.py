@@ -1,4 +1,4 @@
-"""Search for triangles along hierarchies: what rays of the camera, on a GPU, and rays to the lights meet.
+"""Search, along hierarchies, for the triangles that rays of the camera (on a GPU) and rays to the lights meet.
 
 Only the search is done by kernels. Depths, normals and colours are computed by the plain renderer from the triangles found.
 """
@@ -46,7 +46,7 @@ def layout(scene: Scene) -> blocks.Layout:
 
 
 def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays, interpret: bool = False) -> blocks.Nearest:
-    """Return the nearest opaque objects of all pixels, as `blocks.nearest`. Not differentiable.
+    """Return the nearest opaque objects of all pixels, as `blocks.nearest` does. Not differentiable.
 
     Args:
         scene: Scene with triangles.
@@ -159,7 +159,7 @@ def _cut(scene: Scene, plane: jax.Array) -> jax.Array:
 
 
 def _balls(trees: hierarchies.Hierarchies, unit: shapes.UnitShapes) -> tuple[jax.Array, jax.Array]:
-    """Return centres [N, 3] in the camera's frame and radii [N] of the objects' bounding spheres, m, enlarged by rounding."""
+    """Return centres [N, 3] in the camera's frame and radii [N] of the objects' bounding spheres, m, rounded up."""
     axes = unit.axes[trees.objects]  # rotations
     middle = jnp.sum(axes * (trees.ball[:, :3] - unit.origin[trees.objects])[:, :, None], axis=1)
     distance = jnp.sqrt(jnp.sum(jnp.square(middle), axis=1))

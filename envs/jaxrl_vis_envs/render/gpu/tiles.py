@@ -8,7 +8,7 @@ from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.pixel import shapes
 from jaxrl_vis_envs.render.scene import Scene
 
-PIXELS = 128
+PIXELS_PER_TILE = 128
 """Pixels per tile: a power of two, some of which may be idle. Tuned on an H200."""
 
 
@@ -19,7 +19,7 @@ def tile_shape(height: int, width: int) -> tuple[int, int]:
         high, wide = shape
         return -(-height // high) * -(-width // wide) * (1.0 + 0.1 * abs(np.log2(wide / high) - 1.0))
 
-    return min(((PIXELS // wide, wide) for wide in range(8, PIXELS + 1)), key=cost)
+    return min(((PIXELS_PER_TILE // wide, wide) for wide in range(8, PIXELS_PER_TILE + 1)), key=cost)
 
 
 def rectangles(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:

@@ -1,9 +1,9 @@
 """GPU kernel in which rays walk bounding volume hierarchies (Pallas with Triton), see `hierarchies`.
 
 One program has one warp, and several times as many rays as lanes. Every lane traverses on its own the objects that its ray may
-meet, in the order of their bits, and waits for no other lane to finish an object: a step is some nodes, then the triangles of a
-leaf for the lanes that have reached one. A lane that has finished its ray takes the next one. The same code runs as plain JAX,
-with arrays in the place of memory blocks.
+meet, in the order of their bits, and waits for no other lane to finish an object: a step visits some nodes, then the triangles
+of a leaf for the lanes that have reached one. A lane that has finished its ray takes the next one. The same code runs as plain
+JAX, with arrays in the place of memory blocks.
 """
 
 import functools
@@ -25,10 +25,10 @@ TILE = (4, 8)
 
 LANES = 32
 """Lanes of a program, and pixels of a tile."""
-RAYS = 8
+RAYS_PER_LANE = 8
 """Rays of a lane, on average: a lane that has finished one takes the program's next."""
 # Objects that a lane may look at, and nodes that it may visit, in one step.
-_OBJECTS, _NODES = 2, 6
+_OBJECTS_PER_STEP, _NODES_PER_STEP = 2, 6
 
 _COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
 # Replaces ray components of 0, by which no finite number may be divided.
@@ -143,7 +143,7 @@ def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Ar
         none, and the row of ``maps`` (int32). With ``any_hit``, only the object.
     """
     kinds = [jnp.int32] if any_hit else [jnp.float32, jnp.int32, jnp.int32]
-    count = LANES * RAYS
+    count = LANES * RAYS_PER_LANE
     return kernel_call(
         functools.partial(_kernel, any_hit=any_hit),
         out_shape=[jax.ShapeDtypeStruct(refs.nearest.shape, kind) for kind in kinds],
@@ -157,7 +157,7 @@ def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Ar
 
 
 def in_plain_jax(refs: Refs, any_hit: bool) -> list[jax.Array]:
-    """Traverse the hierarchies as `by_kernel`, along all rays at once. Rays of one call should be few, and coherent."""
+    """Traverse the hierarchies as `by_kernel` does, along all rays at once. Rays of one call should be few, and coherent."""
     return _walk(refs, jnp.arange(refs.nearest.shape[0], dtype=jnp.int32), any_hit)
 
 
@@ -168,8 +168,8 @@ def _whole(shape: tuple[int, ...]) -> pl.BlockSpec:
 
 def _kernel(*refs: Any, any_hit: bool) -> None:
     ins, outs = Refs(*refs[: len(Refs._fields)]), refs[len(Refs._fields) :]
-    first = pl.program_id(0) * LANES * RAYS
-    end = jnp.minimum(first + LANES * RAYS, ins.nearest.shape[0])
+    first = pl.program_id(0) * LANES * RAYS_PER_LANE
+    end = jnp.minimum(first + LANES * RAYS_PER_LANE, ins.nearest.shape[0])
 
     def renew(following: jax.Array, task: _Task, state: _State) -> tuple[jax.Array, _Task, _State]:
         """Store what the finished rays have met, and give their lanes the following ones."""
@@ -295,7 +295,7 @@ def _next_object(refs: Refs, task: _Task, state: _State) -> _State:
     inverse_square = 1.0 / dot(direction, direction)
     idle, (word, left, walked) = state.node >= state.end, state[:2] + state[4:5]
     fresh = jnp.zeros(idle.shape, bool)
-    for _ in range(_OBJECTS):
+    for _ in range(_OBJECTS_PER_STEP):
         looks = idle & ~fresh
         empty = looks & (left == 0) & (word < words)
         bits = (_gather(refs.words, empty, row, jnp.where(empty, word, 0)) for row in task.rows)
@@ -338,7 +338,7 @@ def _enter(refs: Refs, start: Vector, direction: Vector, state: _State, fresh: j
 def _visit_nodes(refs: Refs, nearest: jax.Array, state: _State) -> tuple[_State, jax.Array]:
     """Visit some nodes; return the state and the first row of ``maps`` [L] of the leaf that a lane has met, else -1."""
     node, leaf = state.node, jnp.full_like(state.node, -1)
-    for _ in range(_NODES):
+    for _ in range(_NODES_PER_STEP):
         active = (node < state.end) & (leaf < 0)
         low, high, link, _ = _gather_four(refs.nodes, active, node)
         meets = active & _meets_box(state, low, high, nearest)

@@ -25,8 +25,8 @@ class Hierarchies(NamedTuple):
     """Hierarchies of N objects, meshes or height fields, in the order of `Scene.object_ids`. Equal meshes share theirs.
 
     Attributes:
-        nodes: [S, 4] int32: low and high corner of a node's box in cells (ten bits an axis, x lowest); its link, which is the
-            node after its subtree, and of a leaf -1 - its first row of ``maps``; and 0.
+        nodes: [S, 4] int32: low and high corner of a node's box in cells (ten bits an axis, x lowest); its link: the node
+            after its subtree or, for a leaf, -1 minus its first row of ``maps``; and 0.
         maps: [W, 12] float32, maps to unit triangles, the columns `meshes.MAP`, `LEAF` rows for each leaf.
         rows: [W] int32, rows of `Scene.triangles`; -1 for the padding of a leaf.
         first: [N] int32, first node of an object in the first octant.

@@ -118,7 +118,7 @@ def _flat_normals(corners: np.ndarray) -> np.ndarray:
 
 
 def _single_normals(corners: np.ndarray) -> np.ndarray:
-    """Return `_flat_normals` of [T, 3, 3] float32, with the same sequence of operations as MuJoCo.
+    """Return `_flat_normals` of [T, 3, 3] float32, with the same sequence of operations as in MuJoCo.
 
     MuJoCo compares float32 values, and slopes of 3:4:5, whose cosine is exactly the threshold, are common.
     """

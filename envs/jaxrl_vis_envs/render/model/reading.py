@@ -29,7 +29,7 @@ LIGHTS = ("all", "mujoco")
 
 def body_masses(mj_model: mujoco.MjModel, mounts: Iterable[Mount]) -> tuple[np.ndarray, tuple[int, ...]]:
     """Return masses (kg) and parents of the bodies if any mount follows a centre of mass, else an empty array and tuple."""
-    if all(mount.weighed < 0 for mount in mounts):
+    if all(mount.weighed_body < 0 for mount in mounts):
         return np.zeros(0), ()
     return mj_model.body_mass, tuple(mj_model.body_parentid.tolist())
 
@@ -115,7 +115,7 @@ def check_names(mj_model: mujoco.MjModel, leave_out: tuple[str, ...]) -> None:
 def object_types(mj_model: mujoco.MjModel) -> np.ndarray:
     """Return the `mujoco.mjtGeom` [ngeom + nsite + ntendon] of objects as rendered.
 
-    A signed distance field is MuJoCo's mesh of it, a tendon consists of capsules.
+    A signed distance field is rendered as MuJoCo's mesh of it, a tendon as capsules.
     """
     types = np.concatenate([mj_model.geom_type, mj_model.site_type, np.full(mj_model.ntendon, _CAPSULE)])
     return np.where(types == _SDF, _MESH, types)

@@ -48,7 +48,7 @@ class Atlas(NamedTuple):
     sky: Image | None
 
     @property
-    def used(self) -> bool:
+    def has_textures(self) -> bool:
         """True if any object has a texture."""
         return any(mapping != NONE for mapping in self.mappings)
 

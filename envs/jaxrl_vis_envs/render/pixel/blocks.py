@@ -1,6 +1,6 @@
 """Processing order of pixels: in blocks, one after the other.
 
-On a CPU, XLA drops optimization barriers earlier fusion, and would recompute the nearest hit for every use of it (60 times
+On a CPU, XLA drops optimization barriers before fusion, and would recompute the nearest hit for every use of it (60 times
 slower with colour). It does respect loop boundaries, so there are at least two blocks whenever the number of pixels can be
 divided; intermediate values then also stay in the cache.
 

@@ -21,9 +21,9 @@ class Light(NamedTuple):
     """Light in the camera's frame. Vectors are arrays [3] or three scalars; all other values are scalars.
 
     Attributes:
-        directional: True for a directional light.
-        highlights: True if the light can cause specular highlights.
-        shadows: True if the light casts shadows.
+        is_directional: True for a directional light.
+        has_highlights: True if the light can cause specular highlights.
+        has_shadows: True if the light casts shadows.
         position: Position, m; None for a directional light.
         direction: Unit vector along which the light shines.
         ambient: Ambient colour.
@@ -34,9 +34,9 @@ class Light(NamedTuple):
         exponent: Exponent of the falloff from the cone's axis; None except for a spot light.
     """
 
-    directional: bool
-    highlights: bool
-    shadows: bool
+    is_directional: bool
+    has_highlights: bool
+    has_shadows: bool
     position: jax.Array | None
     direction: jax.Array
     ambient: jax.Array
@@ -99,12 +99,12 @@ def camera_lights(scene: Scene, data: Any, camera_position: jax.Array, camera_ro
 
 
 class LightFacts(NamedTuple):
-    """Static properties of a light: three as in `Light`, and ``cone``, True for a spot light."""
+    """Static properties of a light: three as in `Light`, and ``is_spot``, True for a spot light."""
 
-    directional: bool
-    highlights: bool
-    shadows: bool
-    cone: bool
+    is_directional: bool
+    has_highlights: bool
+    has_shadows: bool
+    is_spot: bool
 
 
 def facts(scene: Scene) -> list[LightFacts]:
@@ -138,16 +138,16 @@ def unpack(scene: Scene, table: Any) -> list[Light]:
     for index, fact in enumerate(facts(scene)):
         values = [table[index, column] for column in range(COLUMNS)]
         vectors: list[Any] = [tuple(values[first : first + 3]) for first in range(0, 18, 3)]
-        if fact.directional:
+        if fact.is_directional:
             vectors[0] = vectors[5] = None
-        cone = values[18:] if fact.cone else (None, None)
+        cone = values[18:] if fact.is_spot else (None, None)
         lights.append(Light(*fact[:3], *vectors, *cone))
     return lights
 
 
 def light_vector(light: Light, point: Vector) -> tuple[Vector, jax.Array | None, jax.Array | None]:
     """Return unit vectors to the light, distances (m) and their inverses, [P] each; the last two are None if directional."""
-    if light.directional:
+    if light.is_directional:
         return tuple(-light.direction[axis] for axis in range(3)), None, None
     assert light.position is not None
     offset = tuple(light.position[axis] - point[axis] for axis in range(3))
@@ -200,7 +200,7 @@ def light_factors(
         fade = fade * lit
     facing = maximum(dot(normal, to_light), 0.0)
     shine: Any = 0.0
-    if light.highlights:
+    if light.has_highlights:
         halfway = normalized(tuple(to_light[axis] + to_camera[axis] for axis in range(3)))
         shine = fade * jnp.where(facing > 0.0, power(dot(normal, halfway), exponent), 0.0)
     return fade, fade * facing, shine

@@ -94,7 +94,7 @@ def appearance_columns(scene: Scene) -> list[jax.Array]:
     ids = np.array(scene.object_ids)
     columns = [jnp.asarray(scene.object_types, jnp.float32), *(scene.rgba[ids, channel] for channel in range(3))]
     columns += [scene.emission[ids], scene.specular[ids], 128.0 * scene.shininess[ids]]
-    if scene.atlas.used:
+    if scene.atlas.has_textures:
         facts, mapping = _atlas_places(scene, ids)
         columns.append(mapping)
         columns.extend(_texture_scales(scene, ids))

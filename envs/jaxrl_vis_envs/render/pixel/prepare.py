@@ -60,10 +60,10 @@ def check_poses(scene: Any, data: Any, rgb: bool) -> None:
     if any(index >= scene.geom_count for index in scene.object_ids):
         _check_kind(data, "site_", scene.site_count, is_exact=True)
     mounts = (scene.camera_mount, *(scene.light_mounts if rgb else ()))
-    posed = max(mount.posed for mount in mounts)
-    if posed > 0:
-        _check_kind(data, "", posed + 1)
-    if any(mount.weighed >= 0 for mount in mounts):
+    last_posed_body = max(mount.last_posed_body for mount in mounts)
+    if last_posed_body > 0:
+        _check_kind(data, "", last_posed_body + 1)
+    if any(mount.weighed_body >= 0 for mount in mounts):
         _check_array(data, "xipos", ((3,),), len(scene.body_parents), is_exact=True)
     if scene.object_ids:
         _check_filled(data)

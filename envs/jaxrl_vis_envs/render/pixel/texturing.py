@@ -17,7 +17,7 @@ def texture_colour(scene: Scene, row: Row, hit: Hit, alpha: bool = False) -> Vec
 
     With ``alpha``, a fourth component is the texture's alpha, which all textures must have.
     """
-    if not scene.atlas.used:
+    if not scene.atlas.has_textures:
         return None
     texture = row.texture
     assert texture is not None

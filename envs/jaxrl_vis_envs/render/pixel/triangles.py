@@ -264,7 +264,7 @@ def cross(scene: Scene, local_map: Any, begin: Any, rays: Rays) -> tuple[jax.Arr
         rays: [P].
 
     Returns:
-        As `_intersect_triangles`, of one triangle.
+        The results of `_intersect_triangles` for one triangle.
     """
     start, direction, _ = camera.ray_parts(scene, rays)
     ray = camera.multiply(local_map, direction)

@@ -14,7 +14,7 @@ _ROOM_POINTS, _TURN_POINTS = 40, 16
 _FOLDED_CLEARANCE = 0.02  # m, minimum distance between the tips of the folded arm's jaws and the centre of the target
 
 
-def reachable(origin: np.ndarray, target: np.ndarray) -> np.ndarray:
+def is_within_reach(origin: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return True where the arm can reach a target in front of it, with obstacles ignored.
 
     The target and the point on the way to it at which the arm is folded must be within the arm's lengths and joint limits, with
@@ -112,7 +112,7 @@ def best_approach(
     local = target - origins
     around = np.asarray(others, float).reshape(1, -1, 2) - origins[:, None, :2]
     rooms = clearance(local, around, np.broadcast_to(radii, around.shape[:2]))
-    can = reachable(origins, np.broadcast_to(target, origins.shape))
+    can = is_within_reach(origins, np.broadcast_to(target, origins.shape))
     if not can.any():
         return Approach(-1, int(better_side(target, np)), -np.inf)
     distance = np.linalg.norm(local[:, :2] - np.array(stalk_arm.SHOULDER), axis=-1)

@@ -17,13 +17,13 @@ import jaxrl_vis_envs
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.trained.policy import Policy
 from jaxrl_vis.stalks.grasping.arm import control
-from jaxrl_vis.stalks.grasping.arm.approach import reachable
+from jaxrl_vis.stalks.grasping.arm.approach import is_within_reach
 from jaxrl_vis.stalks.grasping.arm.control import Gains, Timing
 from jaxrl_vis.stalks.grasping.arm.reach import Reaching, ReachResult, Scene, begin, build_arm_model, held_stalks, step_control
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.pixels import ImageObserver
 from jaxrl_vis_envs.plants import bending
-from jaxrl_vis_envs.plants.bending import Shape
+from jaxrl_vis_envs.plants.bending import StalkShapes
 from jaxrl_vis_envs.plants.stand import Stands
 from jaxrl_vis_envs.tasks import stalk_arm
 from jaxrl_vis_envs.tasks.stalk_reach import HOME, StalkReach, clamp_to_workspace
@@ -75,7 +75,7 @@ def reach_by_policy(
         RequestError: The policy is not one of VisualStalkReach, or does not observe single images.
     """
     check_policy(policy)
-    can = reachable(stands.origin, targets)
+    can = is_within_reach(stands.origin, targets)
     count = len(stands)
     fill = np.concatenate([np.arange(count), np.zeros(max(8, 1 << (count - 1).bit_length()) - count, int)])
     local = np.where(can[:, None], targets - stands.origin, np.array(HOME))[fill].astype(np.float32)
@@ -114,15 +114,15 @@ def _compile_programs(policy: Policy) -> tuple[Any, Any]:
         fitted.scene = observer.scene.replace(size=observer.scene.size.at[geoms].set(model.geom_size[geoms]))
         return fitted(data)
 
-    def draw(shape: Shape, target: jax.Array) -> jax.Array:
-        model = bending.set_stalk_properties(arms.model, arms.layout, shape)
-        data = bending.place_stands(arms.rest, arms.layout, shape)
+    def draw(stalk_shapes: StalkShapes, target: jax.Array) -> jax.Array:
+        model = bending.set_stalk_properties(arms.model, arms.layout, stalk_shapes)
+        data = bending.place_stands(arms.rest, arms.layout, stalk_shapes)
         joints = stalk_arm.joints_at(target, 1.0)
         return image(model, mjx_model.kinematics(model, data.replace(qpos=data.qpos.at[: stalk_arm.ARM_JOINTS].set(joints))))
 
-    def episode(shape: Shape, goal: jax.Array, key: jax.Array, wind: jax.Array) -> dict[str, jax.Array]:
-        scene = Scene(shape, bending.sample_gusts(key, wind), jnp.float32(1.0))
-        model = bending.set_stalk_properties(arms.model, arms.layout, shape)
+    def episode(stalk_shapes: StalkShapes, goal: jax.Array, key: jax.Array, wind: jax.Array) -> dict[str, jax.Array]:
+        scene = Scene(stalk_shapes, bending.sample_gusts(key, wind), jnp.float32(1.0))
+        model = bending.set_stalk_properties(arms.model, arms.layout, stalk_shapes)
 
         def step(moving: _LoopState, _: None) -> tuple[_LoopState, dict[str, jax.Array]]:
             reaching, place = moving

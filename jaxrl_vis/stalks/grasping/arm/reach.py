@@ -20,12 +20,12 @@ import numpy as np
 
 import jaxrl_vis_envs
 from jaxrl_vis.stalks.grasping.arm import control
-from jaxrl_vis.stalks.grasping.arm.approach import reachable
+from jaxrl_vis.stalks.grasping.arm.approach import is_within_reach
 from jaxrl_vis.stalks.grasping.arm.control import ControllerState, Gains, Timing
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.plants import bending
-from jaxrl_vis_envs.plants.bending import Gusts, Layout, Shape
+from jaxrl_vis_envs.plants.bending import Gusts, Layout, StalkShapes
 from jaxrl_vis_envs.plants.stand import Stands
 from jaxrl_vis_envs.tasks import stalk_arm
 
@@ -102,12 +102,12 @@ class Scene(NamedTuple):
     """Constants of one arm's reach.
 
     Attributes:
-        shape: Shapes of its stalks.
+        stalk_shapes: Shapes of its stalks.
         gusts: Wind.
         side: [] float32, solution of the inverse kinematics, 1 or -1.
     """
 
-    shape: Shape
+    stalk_shapes: StalkShapes
     gusts: Gusts
     side: jax.Array
 
@@ -185,7 +185,7 @@ def reach(
     wind = np.asarray(wind_mm, np.float32)
     if wind.shape not in ((), (count,)) or not (wind >= 0).all():
         raise ValueError(f"wind_mm must be at least 0, one number or one for each of {count} arms, got {wind_mm}")
-    can = reachable(stands.origin, targets)
+    can = is_within_reach(stands.origin, targets)
     targets = np.where(can[:, None], targets, stands.origin + np.array(control.HOME, np.float32))
     side = np.asarray(control.better_side(targets - stands.origin, np) if sides is None else sides, np.float32)
     if side.shape != (count,) or not (np.abs(side) == 1).all():
@@ -197,10 +197,10 @@ def reach(
     # Pad the batch to the size of the program with copies of the first arm.
     fill = np.concatenate([np.arange(count), np.zeros(max(_MIN_ARMS, 1 << (count - 1).bit_length()) - count, int)])
     start, advance = _compile_programs(stands.stalk.shape[1], timing, gains)
-    shape = jax.tree.map(lambda part: part[fill], bending.shapes(stands))
+    stalk_shapes = jax.tree.map(lambda part: part[fill], bending.shapes(stands))
     winds = np.broadcast_to(wind / 1000, (count,))[fill]
     keys = key[fill] if key.shape else jax.random.split(key, len(fill))
-    scene, reaching = start(shape, keys, winds, side[fill])
+    scene, reaching = start(stalk_shapes, keys, winds, side[fill])
     parts, aimed_at = [], targets
     for call in range(_count_calls(timing.reach) + _count_calls(timing.close)):
         if observer is not None and call:
@@ -251,7 +251,7 @@ def _observe_targets(
     if updated.shape != targets.shape:
         raise ValueError(f"a look must return targets {list(targets.shape)}, got {list(updated.shape)}")
     there = np.all(np.isfinite(updated), axis=-1)
-    there &= is_reachable & reachable(stands.origin, np.where(there[:, None], updated, 0.0))
+    there &= is_reachable & is_within_reach(stands.origin, np.where(there[:, None], updated, 0.0))
     return np.where(there[:, None], updated, targets)
 
 
@@ -272,8 +272,8 @@ def _compile_programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, A
     """Return the compiled programs that start B arms and advance them by `LOOK_INTERVAL` s."""
     arms = build_arm_model(stalks)
 
-    def start(shape: Shape, key: jax.Array, wind: jax.Array, side: jax.Array) -> tuple[Scene, Reaching]:
-        scene = Scene(jax.tree.map(jnp.asarray, shape), bending.sample_gusts(key, wind), side)
+    def start(stalk_shapes: StalkShapes, key: jax.Array, wind: jax.Array, side: jax.Array) -> tuple[Scene, Reaching]:
+        scene = Scene(jax.tree.map(jnp.asarray, stalk_shapes), bending.sample_gusts(key, wind), side)
         return scene, begin(arms, scene)
 
     def advance(scene: Scene, reaching: Reaching, target: jax.Array) -> tuple[Reaching, dict[str, jax.Array]]:
@@ -284,9 +284,9 @@ def _compile_programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, A
 
 def begin(arms: ArmModel, scene: Scene, home: tuple[float, float, float] = control.HOME) -> Reaching:
     """Return the initial state of an arm with its grip at ``home`` (m, frame of the stand) among swaying stalks."""
-    model = bending.set_stalk_properties(arms.model, arms.layout, scene.shape)
-    data = bending.place_stands(arms.rest, arms.layout, scene.shape)
-    swayed = bending.hinge_angles(arms.layout, model.nv, bending.displacement(scene.gusts, scene.shape.foot, 0.0))
+    model = bending.set_stalk_properties(arms.model, arms.layout, scene.stalk_shapes)
+    data = bending.place_stands(arms.rest, arms.layout, scene.stalk_shapes)
+    swayed = bending.hinge_angles(arms.layout, model.nv, bending.displacement(scene.gusts, scene.stalk_shapes.foot, 0.0))
     joints = stalk_arm.joints_at(jnp.asarray(home, jnp.float32), scene.side)
     data = mjx_model.kinematics(model, data.replace(qpos=(data.qpos + swayed).at[: stalk_arm.ARM_JOINTS].set(joints)))
     nothing = jnp.zeros(len(arms.layout.mocap), bool)
@@ -302,7 +302,7 @@ def _advance(
         The new state, and a report: path, actual positions and poses at each point, held and touched stalks, and the positions
         of the stalks at the target's height.
     """
-    model = bending.set_stalk_properties(arms.model, arms.layout, scene.shape)
+    model = bending.set_stalk_properties(arms.model, arms.layout, scene.stalk_shapes)
 
     def step(reaching: Reaching, _: None) -> tuple[Reaching, None]:
         time = reaching.data.time
@@ -349,7 +349,7 @@ def step_control(
         reaching.controllers, data.qpos[:3], data.qvel[:3], stalk_arm.joints_at(target, scene.side), gains
     )
     jaws = jnp.where(is_closing, gains.jaw_force, -gains.jaw_force) * jnp.ones(2, jnp.float32)
-    wind = bending.wind_torque(model, arms.layout, scene.gusts, scene.shape.foot, data.time)
+    wind = bending.wind_torque(model, arms.layout, scene.gusts, scene.stalk_shapes.foot, data.time)
     none = jnp.zeros(model.nv - stalk_arm.JOINTS, jnp.float32)
     data = mjx_model.step(model, data.replace(qfrc_applied=wind + jnp.concatenate([forces, jaws, none])), False)
     touches = {name: data._impl.contact.dist[places] < 0 for name, places in arms.contacts.items()}

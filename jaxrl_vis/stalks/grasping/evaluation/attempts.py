@@ -1,6 +1,6 @@
 """From grasp points to attempts: planning of stops and approaches, their simulation, and the results.
 
-The robot stops where it took its pairs, and knows these positions from its stitches. `choice` chooses the stop and approach for
+The robot stops where it took its pairs, and its stitches give these positions. `choice` chooses the stop and approach for
 each grasp point. The ground truth is used only to score what the jaws hold, and what they could have held.
 
 open    open loop: the arm moves to the grasp point as perceived, without looking again
@@ -65,7 +65,7 @@ class Plan:
             across the row, m; NaN where the pair does not show the stalk.
         stands: True stalks around the arm at the stop of each attempt.
         standing: True stalks of the stretch that the run passes.
-        detected: Detected stalks around the arm, laid out as `stands`; None unless planned for a policy, or without targets.
+        detected: Detected stalks around the arm, laid out like `stands`; None unless planned for a policy, or without targets.
     """
 
     run: int
@@ -188,7 +188,7 @@ def reachable_from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray
         [B] bool.
     """
     masts = (stops + [0.0, MAST_DISTANCE, 0.0]) * [1.0, 1.0, 0.0]
-    return np.asarray(approach.reachable(masts[:, None], points[None]).any(axis=0))
+    return np.asarray(approach.is_within_reach(masts[:, None], points[None]).any(axis=0))
 
 
 def _true_stalks(plot: Plot, origins: np.ndarray, number: int) -> tuple[TrueStalk, ...]:

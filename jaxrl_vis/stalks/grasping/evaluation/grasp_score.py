@@ -131,7 +131,7 @@ class Score:
         of_reachable: Stalks grasped alone among all reachable ones.
         of_all: Stalks grasped alone among all stalks of the stretches: the end-to-end success rate.
         outcomes: Attempts with each of `OUTCOMES` among all attempts.
-        stages: Reachable stalks by the stage that they came to, one entry for each of `STAGES`.
+        stages: Reachable stalks by the stage that they reached, one entry for each of `STAGES`.
         false_targets: Attempts without a matched stalk among all attempts.
         collisions: Attempts whose links touched another stalk, among those sent.
         brushes: Attempts whose open gripper touched another stalk, among those sent.
@@ -300,7 +300,7 @@ def thesis_ratio(attempts: Iterable[Attempt]) -> tuple[float, int]:
 
 
 def _stage(attempt: Attempt | None, tolerance: float) -> str:
-    """Return the stage, one of `STAGES`, that a stalk came to; ``attempt`` is None if the stalk was not detected."""
+    """Return the stage, one of `STAGES`, that a stalk reached; ``attempt`` is None if the stalk was not detected."""
     if attempt is None:
         return "not detected"
     if attempt.outcome == "success":

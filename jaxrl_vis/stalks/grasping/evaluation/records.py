@@ -127,19 +127,19 @@ def summarize(records: Sequence[Record]) -> dict[str, Any]:
     """Summarize the records of runs, as values for JSON.
 
     Returns:
-        The figures of `summarize_scores`, ``devices`` and ``workers`` of the records, and under ``reaches`` the scores of those
+        The metrics of `summarize_scores`, ``devices`` and ``workers`` of the records, and under ``reaches`` the scores of those
         `Reaches` that all records hold, by name.
     """
-    figures: dict[str, Any] = summarize_scores([read_score(record) for record in records])
-    figures["devices"] = sorted({record["device"] for record in records})
-    figures["workers"] = sorted({record["workers"] for record in records})
+    metrics: dict[str, Any] = summarize_scores([read_score(record) for record in records])
+    metrics["devices"] = sorted({record["device"] for record in records})
+    metrics["workers"] = sorted({record["workers"] for record in records})
     known = [set(record.get("reaches", {})) for record in records]
     if known and (everywhere := set.intersection(*known)):
-        figures["reaches"] = {name: score_figures(grasp_score(records, name)) for name in sorted(everywhere)}
-    return figures
+        metrics["reaches"] = {name: score_metrics(grasp_score(records, name)) for name in sorted(everywhere)}
+    return metrics
 
 
-def score_figures(score: Score) -> dict[str, Any]:
+def score_metrics(score: Score) -> dict[str, Any]:
     """Return the thesis's ratio and all proportions of a score, with counts and intervals, as values for JSON."""
     proportions = {
         proportion.name: {"count": proportion.count, "of": proportion.total, "interval": proportion.interval}

@@ -3,7 +3,7 @@
 row -> five pairs -> perception -> grasp points         as `run` does, without files
     -> true stalks, poses and masks                     from the row itself
 
-Only stalks count that at the preferred height stand within the 0.5 m that the robot drives along. A grasp point hits the stalk
+Stalks count if they stand within the 0.5 m that the robot drives along, at the preferred height. A grasp point hits the stalk
 that it is matched with, one to one, if it lies within 30 mm of that stalk's centre at its own height.
 """
 
@@ -235,7 +235,7 @@ def summarize_scores(scores: Iterable[RunScore]) -> dict[str, Any]:
     seconds = {
         name: float(np.median([score.seconds[name] for score in scores])) for name in (scores[0].seconds if scores else ())
     }
-    figures = {
+    metrics = {
         "runs": len(scores),
         "stalks": true,
         "grasp_points": detected,
@@ -255,9 +255,9 @@ def summarize_scores(scores: Iterable[RunScore]) -> dict[str, Any]:
     masks = [score.mask for score in scores if score.mask is not None]
     if masks:
         painted, wanted = sum(mask.painted for mask in masks), sum(mask.true for mask in masks)
-        figures["mask_f1"] = 2.0 * sum(mask.hits for mask in masks) / (painted + wanted) if painted + wanted else math.nan
-        figures["mask_boundary_px"] = float(np.nanmean([mask.boundary for mask in masks]))
-    return figures
+        metrics["mask_f1"] = 2.0 * sum(mask.hits for mask in masks) / (painted + wanted) if painted + wanted else math.nan
+        metrics["mask_boundary_px"] = float(np.nanmean([mask.boundary for mask in masks]))
+    return metrics
 
 
 def _quantile(values: np.ndarray, fraction: float) -> float:

@@ -136,7 +136,7 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
     def declare(about: dict[str, Any]) -> tuple[Settings, Any]:
         values = about.pop("generator")
         if not isinstance(values, dict):
-            raise ValueError("the generator is no table")
+            raise ValueError("the generator is not a table")
         if about.pop("schema") != SCHEMA or values.keys() != _HINTS.keys() or values["loss"] not in ("gan", "segmentation"):
             raise RequestError(f"{path} holds weights of another version: train them again with `{_COMMAND}`")
         settings = Settings(**{name: fields.check(f"{path}: {name}", _HINTS[name], value) for name, value in values.items()})

@@ -164,7 +164,7 @@ def _distance_driven(view: View, next_view: View) -> float:
 
 @contextlib.contextmanager
 def _threads(pairs: int) -> Iterator[Callable[..., Iterator[Any]]]:
-    """Yield a `map` over pairs that runs in as many threads as OpenCV may use, or the built-in one if that is one.
+    """Yield a `map` over pairs that runs in as many threads as OpenCV may use, or the built-in one for one thread.
 
     The threaded one submits its calls immediately.
     """

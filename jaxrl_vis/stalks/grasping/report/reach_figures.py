@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.worker_pool import Record
 from jaxrl_vis.report.plots import FAINT, INK
-from jaxrl_vis.stalks.grasping.arm.approach import reachable
+from jaxrl_vis.stalks.grasping.arm.approach import is_within_reach
 from jaxrl_vis.stalks.grasping.arm.reach import reach
 from jaxrl_vis.stalks.grasping.evaluation.attempts import plan, redetecting_observer, wind_keys
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Score
@@ -51,7 +51,7 @@ def draw_reach(
     scene = draw_scene(family, seed)
     _, perception = score_scene(scene, mask)
     made = plan(scene, perception, seed)
-    sent = np.flatnonzero(~made.refused & reachable(made.stands.origin, made.targets))
+    sent = np.flatnonzero(~made.refused & is_within_reach(made.stands.origin, made.targets))
     if not len(sent):
         raise RequestError(f"there is nothing that the arm can be sent to in run {seed}: choose another --seed")
     keys = wind_keys(np.full(len(made.targets), seed), np.arange(len(made.targets)))

@@ -15,7 +15,7 @@ from jaxrl_vis.stalks.grasping.arm.control import Timing
 from jaxrl_vis.stalks.grasping.arm.reach import ReachResult, build_arm_model
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.plants import bending
-from jaxrl_vis_envs.plants.bending import Shape
+from jaxrl_vis_envs.plants.bending import StalkShapes
 from jaxrl_vis_envs.plants.stand import Stands
 from jaxrl_vis_envs.render import Scene, render_planes
 
@@ -57,9 +57,9 @@ def write_reaches(
 
 def reach_frames(stands: Stands, result: ReachResult, index: int, size: int) -> np.ndarray:
     """Render the camera's view of one reach: [F, size, size, 3] uint8, ``2 * result.interval`` s apart."""
-    shape = jax.tree.map(lambda part: part[index], bending.shapes(stands))
+    stalk_shapes = jax.tree.map(lambda part: part[index], bending.shapes(stands))
     draw = _compile_drawing(stands.stalk.shape[1], size)
-    return np.stack([np.asarray(draw(shape, pose)) for pose in result.poses[index, ::_EVERY]])
+    return np.stack([np.asarray(draw(stalk_shapes, pose)) for pose in result.poses[index, ::_EVERY]])
 
 
 @functools.cache
@@ -68,9 +68,9 @@ def _compile_drawing(stalks: int, size: int) -> Any:
     scene = Scene.from_mjmodel(arms.mj_model, "work", size, size)
     geoms = np.concatenate([arms.layout.lower_geom, arms.layout.upper_geom])
 
-    def draw(shape: Shape, pose: jax.Array) -> jax.Array:
-        model = bending.set_stalk_properties(arms.model, arms.layout, shape)
-        data = mjx_model.kinematics(model, bending.place_stands(arms.rest, arms.layout, shape).replace(qpos=pose))
+    def draw(stalk_shapes: StalkShapes, pose: jax.Array) -> jax.Array:
+        model = bending.set_stalk_properties(arms.model, arms.layout, stalk_shapes)
+        data = mjx_model.kinematics(model, bending.place_stands(arms.rest, arms.layout, stalk_shapes).replace(qpos=pose))
         fitted = scene.replace(size=scene.size.at[geoms].set(model.geom_size[geoms]))
         rgb = render_planes(fitted, data, depth=False, quantized=True).rgb
         assert rgb is not None  # it was asked for
@@ -100,7 +100,7 @@ def _outcome_caption(time: float, held_stalks: set[int], is_alone: bool) -> str:
 
 
 def _add_caption(frame: np.ndarray, left: str, right: str, colour: tuple[int, int, int]) -> Image.Image:
-    """Return the frame below a header with two captions; the right one has ``colour`` if it says what is held."""
+    """Return the frame below a header with two captions; the right one has ``colour`` if it states what is held."""
     canvas = Image.new("RGB", (frame.shape[1], frame.shape[0] + _HEADER), BACKGROUND)
     canvas.paste(Image.fromarray(frame), (0, _HEADER))
     draw = ImageDraw.Draw(canvas)

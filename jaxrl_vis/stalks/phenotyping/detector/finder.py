@@ -310,7 +310,7 @@ def _in_frame(band: Band, frame: Frame) -> Band:
 
 
 def _is_inside_frame(stalk: np.ndarray, frame: Frame) -> bool:
-    """Return True if, of the axis of a stalk [6] within the image, more than half lies outside the black borders."""
+    """Return True if more than half of a stalk's axis within the image, of ``stalk`` [6], lies outside the black borders."""
     if frame.shown is None:
         return True
     shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]
@@ -320,7 +320,7 @@ def _is_inside_frame(stalk: np.ndarray, frame: Frame) -> bool:
 
 
 def _clear_border_rows(mask: np.ndarray, corner: tuple[int, int], frame: Frame) -> np.ndarray:
-    """Return a mask with the rows cleared in which it reaches a black border: the stalk may continue there."""
+    """Return a mask, cleared in the rows in which it reaches a black border: the stalk may continue there."""
     if frame.shown is None or not mask.size:
         return mask
     shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]

@@ -20,9 +20,9 @@ NOTHING, UNCLEAR, STALK = 0, 1, 2
 STEP = 8
 """Rows of the resized image per row of the edges."""
 ABSENT = -1.0
-"""Visible fraction of rows without the stalk. Hidden rows have 0, rows in which its visibility is unknown `UNKNOWN`."""
+"""Visible fraction of rows without the stalk. Hidden rows have 0, and rows of unknown visibility have `UNKNOWN`."""
 UNKNOWN = 0.3
-"""Visible fraction of rows of which annotations say nothing, between `_HIDDEN` and `_SHOWN`."""
+"""Visible fraction of rows that annotations do not cover, between `_HIDDEN` and `_SHOWN`."""
 WHOLE = 0.7
 """Minimum fraction of its width that a clear section has inside the image."""
 _SHOWN = 0.5  # minimum visible fraction of a section to be a target

@@ -79,7 +79,7 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
     def declare(about: dict[str, Any]) -> tuple[Settings, Any]:
         values = about.pop("settings")
         if not isinstance(values, dict):
-            raise ValueError("settings are no table")
+            raise ValueError("settings are not a table")
         values = {_FIELDS.get(str(key), str(key)): value for key, value in values.items()}
         if about.pop("schema") != SCHEMA or not values.keys() <= _HINTS.keys():
             raise RequestError(f"{path} holds weights of another version: train them again with `{_COMMAND}`")

@@ -239,7 +239,7 @@ def summarize_scores(scores: Iterable[PlotScore], min_score: float = 0.5) -> dic
         ``width_mae_mm``, ``width_bias_mm``, ``width_mae_two_people_mm`` (against the simulated mean of two people with
         calipers), ``width_coverage_95`` (fraction of true widths in the stated 95 % interval), errors of widths at 24 inches,
         ``ap50``, ``precision``, ``recall``, ``f1``, the best F1 and the minimum score that gives it, ``seconds_per_pair``, the
-        numbers of samples, and, if evaluated, figures of the thesis's methods. NaN if there are no samples.
+        numbers of samples, and, if evaluated, metrics of the thesis's methods. NaN if there are no samples.
     """
     scores = list(scores)
     true = np.array([score.true for score in scores], float)

@@ -115,8 +115,8 @@ def _check_image(image: dict[str, Any], index: int) -> dict[str, Any]:
         )
     sides = _finite_numbers([image.get("width"), image.get("height")])
     if sides is None or min(sides) < 1 or any(side % 1 for side in sides):
-        said = f"{reprlib.repr(image.get('width'))} and {reprlib.repr(image.get('height'))}"
-        raise RequestError(f"{image['source']}: image {name} needs a width and a height in pixels, not {said}")
+        size_read = f"{reprlib.repr(image.get('width'))} and {reprlib.repr(image.get('height'))}"
+        raise RequestError(f"{image['source']}: image {name} needs a width and a height in pixels, not {size_read}")
     if sides[0] * sides[1] > MAX_PIXELS:
         limit = f"more than {MAX_PIXELS // 10**6} million pixels"
         raise RequestError(f"{image['source']}: image {name} is said to have {sides[0]:g} x {sides[1]:g}, {limit}")
@@ -177,11 +177,13 @@ def _check_segmentation(segmentation: Any, size: tuple[int, int]) -> dict[str, A
     if not segmentation:
         return None
     if isinstance(segmentation, dict):
-        said, counts = _finite_numbers(segmentation.get("size")), segmentation.get("counts")
-        if said is None or len(said) != 2 or not isinstance(counts, (str, list)):
+        stated_size, counts = _finite_numbers(segmentation.get("size")), segmentation.get("counts")
+        if stated_size is None or len(stated_size) != 2 or not isinstance(counts, (str, list)):
             raise ValueError("has a mask without size (height, width) and counts")
-        if tuple(said) != size:
-            raise ValueError(f"has a mask of {said[1]:g} x {said[0]:g} pixels, but its image has {size[1]} x {size[0]}")
+        if tuple(stated_size) != size:
+            raise ValueError(
+                f"has a mask of {stated_size[1]:g} x {stated_size[0]:g} pixels, but its image has {size[1]} x {size[0]}"
+            )
         try:
             numbers = decode_counts(counts) if isinstance(counts, str) else _finite_numbers(counts)
             if numbers is None:

@@ -67,7 +67,7 @@ def _parse_yaml(text: str) -> Any:
             place.append(value)
         elif keys[-1] is None:
             if not isinstance(value, (str, float)):
-                raise ValueError("a name that is no word")
+                raise ValueError("a name that is not a word")
             keys[-1] = str(value)
         else:
             place[keys[-1]], keys[-1] = value, None

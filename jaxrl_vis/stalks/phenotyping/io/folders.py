@@ -291,7 +291,7 @@ def _has_pairs(folder: Path) -> bool:
 
 
 def _pair_by_name(folder: Path) -> _Sides:
-    """Find images whose names tell their side, by a word, a letter or a camera number."""
+    """Find images whose names indicate their side, by a word, a letter or a camera number."""
     images = {path: readable(path.stem) for path in image_files(folder)}
     images = {path: stem for path, stem in images.items() if "disparity" not in stem.lower()}
     stems = {stem.lower() for stem in images.values()}
@@ -329,7 +329,7 @@ def _pair_by_counter(stem: str, stems: set[str]) -> list[tuple[str, str]]:
 
 
 def _match_side(stem: str, stems: set[str]) -> re.Match[str] | None:
-    """Find the word or letter of an image's name that tells its side; None if there is none.
+    """Find the word or letter of an image's name that indicates its side; None if there is none.
 
     Names of field rows and repetitions may hold such letters, too, as in R2_left_000 or plot_R1_L_000. So words take precedence
     over letters, matches whose exchange gives the name of another image over those that do not, and later matches over earlier

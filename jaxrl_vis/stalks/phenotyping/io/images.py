@@ -55,7 +55,7 @@ def _header(path: Path) -> tuple[tuple[int, int], int]:
     """Return the stored height and width of an image, and its EXIF orientation (1 to 8); raises as `image_size` does."""
     if not path.is_file():
         path.stat()
-        raise _unreadable(path, "is no ordinary file")
+        raise _unreadable(path, "is not a regular file")
     with path.open("rb") as file:
         size = read_header_size(file)
         file.seek(0)

@@ -100,7 +100,7 @@ def decode_counts(text: str) -> list[int]:
     for letter in text:
         bits = ord(letter) - 48
         if not 0 <= bits < 64 or shift > 50:
-            raise ValueError("runs of a mask hold what is no number of pixels")
+            raise ValueError("runs of a mask hold something that is not a number of pixels")
         value |= (bits & 0x1F) << shift
         shift += 5
         if bits & 0x20:
@@ -109,7 +109,7 @@ def decode_counts(text: str) -> list[int]:
             value -= 1 << shift
         counts.append(value + (counts[-2] if len(counts) > 2 else 0))
         if abs(counts[-1]) > _MAX_RUN:
-            raise ValueError("runs of a mask hold what is no number of pixels")
+            raise ValueError("runs of a mask hold something that is not a number of pixels")
         value, shift = 0, 0
     if shift:
         raise ValueError("runs of a mask end in the middle of a number")

@@ -48,4 +48,4 @@ def baseline_in_metres(path: Path, length: float, unit: str) -> float:
     units = [f"{_OPTION} {name} if the chessboard was measured in {name} ({lengths[name]:.3g} m)" for name in fitting]
     squares = f"{_OPTION} 24mm if it was counted in squares with sides of 24 mm"
     counted = f"{length:g} {unit}" if unit in METRES else f"{length:g} squares of {unit}"
-    raise RequestError(f"{path} has a baseline of {counted}, which is no stereo pair's: say {', or '.join([*units, squares])}")
+    raise RequestError(f"{path} has a baseline of {counted}, not that of a stereo pair: say {', or '.join([*units, squares])}")

@@ -113,7 +113,7 @@ def match_rows(
         )
         for line, begin, end in zip(np.asarray(lines, int), *edges)
     ]
-    wanted = [strip for strip in wanted if strip.inside(left.shape, half_height, spread)]
+    wanted = [strip for strip in wanted if strip.is_inside(left.shape, half_height, spread)]
     # A few windows are searched over all disparities. If these agree, the others are searched near the expected disparity.
     first = sorted(set(np.linspace(0, len(wanted) - 1, min(_COARSE_WINDOWS, len(wanted))).round().astype(int)))
     limits = int(np.floor(bounds[0])), int(np.ceil(bounds[1]))
@@ -145,7 +145,7 @@ class _Window:
     first: int
     last: int
 
-    def inside(self, shape: tuple[int, ...], half_height: int, spread: int) -> bool:
+    def is_inside(self, shape: tuple[int, ...], half_height: int, spread: int) -> bool:
         """Return True if the window is at least 6 pixels wide and, with the margin for vertical misalignment, in the image.
 
         Args:

@@ -36,12 +36,12 @@ def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str 
     for sighting, label in zip(sightings, labels):
         _draw_outline(canvas, sighting, COUNTED if label is not None else REJECTED, scale, thickness)
     writer = _LabelWriter(canvas, max(size[0] / 2200, 0.3), thickness)
-    writer.legend(readable(title))  # OpenCV does not survive a lone surrogate
+    writer.write_legend(readable(title))  # OpenCV does not survive a lone surrogate
     for sighting, label in sorted(zip(sightings, labels), key=lambda pair: pair[0].column):
         width = "" if sighting.diameter_mm is None else f"{sighting.diameter_mm:.1f} mm"
         text = " ".join(filter(None, (f"#{label}" if label else "", width))) or "no width"
         place = round((sighting.axis[0] + 0.5) * scale - 0.5), round((sighting.box[1] + 0.5) * scale - 0.5)
-        writer.above(place, text, COUNTED if label is not None else REJECTED)
+        writer.write_above(place, text, COUNTED if label is not None else REJECTED)
     return canvas
 
 
@@ -84,7 +84,7 @@ class _LabelWriter:
         self._canvas, self._letters, self._thick = canvas, font_scale, thickness
         self._taken: list[tuple[int, int, int, int]] = []
 
-    def above(self, point: tuple[int, int], text: str, colour: tuple[int, int, int]) -> None:
+    def write_above(self, point: tuple[int, int], text: str, colour: tuple[int, int, int]) -> None:
         """Write text above a point (column, row), as close as there is free space, with a line down to the point."""
         wide, tall = self._size(text)
         left = min(max(point[0] - wide // 2, 0), max(self._canvas.shape[1] - wide, 0))
@@ -94,7 +94,7 @@ class _LabelWriter:
         cv2.line(self._canvas, (point[0], bottom), point, colour, 1, cv2.LINE_AA)
         self._write((left, bottom), text, colour)
 
-    def legend(self, title: str) -> None:
+    def write_legend(self, title: str) -> None:
         """Write a title and the meaning of the colours in the lower left corner."""
         left, bottom = self._size("0")[1] // 2, self._canvas.shape[0] - self._size("0")[1] // 2
         for text, colour in [*([(title, (255, 255, 255))] if title else []), *_LEGEND]:

@@ -87,7 +87,7 @@ class PlotResult:
         start: Position of the first pair, the origin of the stalks' positions, m.
         image_width: Width of the images, pixels.
         count_reason: Reason that there is no count, beyond the flag; empty if there is a count or nothing to add.
-        unfamiliar_note: Description of how the images differ from those that the networks know; empty if they do not.
+        unfamiliar_note: Description of how the images differ from the training images; empty if they do not.
     """
 
     row: dict[str, Any]

@@ -55,7 +55,7 @@ _MAX_ERROR = 0.08  # of a width: maximum scatter between pairs before it is unce
 NO_GROUND = "no visible ground"
 """Flag of widths at an unknown height, as the ground was not seen."""
 NO_ROW = "nothing like a row seen"
-"""Flag of a plot without counted stalks: it is empty, or its images differ from those that the networks know."""
+"""Flag of a plot without counted stalks: it is empty, or its images differ from the training images."""
 PARTLY_SEEN = "part of the row not seen"
 """Flag of a plot without a count, as no pair shows some part of the row."""
 FEW_FRAMES = "few frames"

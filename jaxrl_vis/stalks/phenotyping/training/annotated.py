@@ -107,7 +107,7 @@ def _own_masks(
 ) -> np.ndarray:
     """Cut the masks of stalk crops out of annotations. With the first two arguments bound, a `MaskFunction`.
 
-    One at a time: masks may overlap, and all of an image together could exceed the memory.
+    Masks are cut one at a time: they may overlap, and all masks of an image together could exceed the memory.
     """
     crops = [
         np.asarray(cut_crops(jnp.asarray(_annotated_mask(annotations[part], size)), stalks[index : index + 1], shape))

@@ -64,7 +64,7 @@ def augment_geometry(
     Returns:
         Images, black where the originals did not reach; stalks; and kinds. Shapes and dtypes are those of the arguments. Boxes
         are clipped to the image, and become ``NOTHING`` if hardly anything is left. Edges are not clipped, and their kinds are
-        unchanged: rows that leave the image become `ABSENT`, those of which less than `WHOLE` is left at most `UNKNOWN`.
+        unchanged: rows that leave the image become `ABSENT`, and rows with less than `WHOLE` left become at most `UNKNOWN`.
     """
     keys = jax.random.split(key, images.shape[0])
     return jax.vmap(_transform_stalks)(images, stalks, kinds, sizes, keys)
@@ -198,7 +198,7 @@ def _add_texture(crops: jax.Array, key: jax.Array) -> jax.Array:
 
 
 def _add_stripes(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
-    """Add light and dark stripes along the stalk to 70 % of the crops, as of ribs and folded sheaths, varying by internode.
+    """Add light and dark stripes along the stalk to 70 % of the crops, like ribs and folded sheaths, varying by internode.
 
     A dark stripe looks like a gap between two stalks, but the stalk continues on its other side.
 

@@ -26,8 +26,8 @@ def synthetic_edges(
 ) -> Edges:
     """Compute the edges of the visible stalks of an image; those with fewer than 12 pixels after resizing are dropped.
 
-    By day, stalks of the rows of plants behind look like those of the near row: they are ``UNCLEAR``. At night, they are
-    background, as the light of the flash falls off.
+    In daytime plots, stalks of the rows of plants behind look like those of the near row: they are ``UNCLEAR``. At night,
+    they are background, as the light of the flash falls off.
 
     Args:
         plot: Plot with its plants.
@@ -46,12 +46,12 @@ def synthetic_edges(
     sampled = np.bincount(bins, minlength=count)  # rows
     lines = (np.arange(count) + 0.5) * STEP * scale[0] - 0.5
     pixel = thin * thin / (scale[0] * scale[1])  # of the resized image
-    by_day = plot.family.scene.share > 0
+    is_daytime = plot.family.scene.share > 0
     candidates: list[tuple[float, np.ndarray, int]] = []
     for number in np.flatnonzero(counts.any(axis=0)).tolist():
         amount = int(counts[:, number].sum())
         row = plot.stalks[number].row
-        if row < 0 or (row > 0 and not by_day) or amount * pixel < _FEW:
+        if row < 0 or (row > 0 and not is_daytime) or amount * pixel < _FEW:
             continue
         sides = _sides(plot.stalks[number], pose, camera, lines)
         if sides is None:

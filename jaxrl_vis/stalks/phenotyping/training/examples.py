@@ -76,8 +76,8 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
     settled = sequence.plot.family
     pixels_per_metre = sequence.drive.true.focal / settled.rig.distance
     rng = np.random.default_rng([seed, 17])
-    by_day, crop_scale = settled.scene.share > 0, 1.0
-    if by_day:  # the scale of third-party images is not known exactly
+    is_daytime, crop_scale = settled.scene.share > 0, 1.0
+    if is_daytime:  # the scale of third-party images is not known exactly
         factor = float(np.exp(rng.uniform(*_SCALES)))
         if settings.section:  # stalk crops keep the scale at which stalks fit into them
             wider = float(np.exp(rng.uniform(*_SECTION_SCALES)))
@@ -100,7 +100,7 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
             pose, seen = sequence.drive.poses[frame], np.asarray(instance)
             edges = synthetic_edges(sequence.plot, pose, true, seen, example.image.shape[:2], scale)
             example = dataclasses.replace(example, edges=edges)
-        if by_day:
+        if is_daytime:
             # Lenses and scales differ between plots, and each shape of crops would need a compilation.
             shape = crop_shape((settings.crop_height, settings.crop_width), family.rig.width / settings.full_width)
             example = resize_crops(crop_randomly(example, (settings.lines, settings.width), rng), shape)
@@ -130,7 +130,7 @@ def crop_randomly(example: Example, max_size: tuple[int, int], rng: np.random.Ge
         rng: Generator of the position.
 
     Returns:
-        Example with clipped stalks, of which those that are hardly left in the image are ``NOTHING``.
+        Example with clipped stalks; those that are hardly left in the image become ``NOTHING``.
     """
     size = example.image.shape[:2]
     lines, columns = (min(length, limit) for length, limit in zip(size, max_size))

@@ -106,8 +106,8 @@ def tune(
         tuning: Fine-tuning schedule.
         start: Initial parameters, whose first layers are frozen; None for random initialisation.
         echo: Progress callback, see `ProgressCallback`.
-        keep: Called with the best parameters so far and their update, so that they survive an interruption. Without images for
-            early stopping, called with the latest parameters at each evaluation.
+        keep: Called with the best parameters so far and the number of updates that led to them, so that they survive an
+            interruption. Without images for early stopping, called with the latest parameters at each evaluation.
 
     Returns:
         Result, whose parameters are on the host: those with the best score on the images for early stopping, which may be the

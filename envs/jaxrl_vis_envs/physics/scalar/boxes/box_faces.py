@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from jaxrl_vis_envs.physics.scalar.boxes.box_model import CONTACTS, CORNERS, LaneContacts, Side
+from jaxrl_vis_envs.physics.scalar.boxes.box_model import CONTACTS_PER_PAIR, CORNERS, LaneContacts, Side
 from jaxrl_vis_envs.physics.scalar.boxes.own_block import in_own_block
 from jaxrl_vis_envs.physics.scalar.contacts import ContactPoint
 from jaxrl_vis_envs.physics.scalar.link_frames import LinkFrames
@@ -204,13 +204,13 @@ def _select_candidate(contacts: LaneContacts, candidates: list[_Candidate]) -> t
     """
     like = 0.0 * (candidates[4].x + contacts.number)
     own, place_x, place_y, index = like + _NONE, like, like, like
-    reaches, chosen = [like + _NONE] * (CONTACTS - 1), [like] * (CONTACTS - 1)
+    reaches, chosen = [like + _NONE] * (CONTACTS_PER_PAIR - 1), [like] * (CONTACTS_PER_PAIR - 1)
     for number, (x, y, is_inside) in enumerate(candidates):
         reach = jnp.where(is_inside, plus(times(contacts.corner[0], x), times(contacts.corner[1], y)), _NONE)
         is_farther = reach > own
         own, index = jnp.where(is_farther, reach, own), jnp.where(is_farther, float(number), index)
         place_x, place_y = jnp.where(is_farther, x, place_x), jnp.where(is_farther, y, place_y)
-        for corner, (along, across) in enumerate(CORNERS[: CONTACTS - 1]):
+        for corner, (along, across) in enumerate(CORNERS[: CONTACTS_PER_PAIR - 1]):
             reach = jnp.where(is_inside, plus(times(along, x), times(across, y)), _NONE)
             is_farther = reach > reaches[corner]
             reaches[corner] = jnp.where(is_farther, reach, reaches[corner])

@@ -1,4 +1,4 @@
-"""Constants of models whose contacts are those of boxes, one of them free, and which of these models the engine supports.
+"""Constants of models whose contacts are between boxes, one of them free, and the test of which models are supported.
 
 The contacts of all pairs, four of each, are spread over the 32 lanes of a warp. A constant of a contact is a number if it is
 the same in all lanes, or else the index of a row of a table with a column per lane.
@@ -18,7 +18,7 @@ from jaxrl_vis_envs.physics.scalar.scalar_model import ScalarModel
 
 LANES = 32
 """Threads of a warp."""
-CONTACTS = 4
+CONTACTS_PER_PAIR = 4
 """Contacts of a pair of boxes."""
 CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))
 """Direction in which each contact of a pair reaches farthest, in half edges of the face."""
@@ -126,7 +126,7 @@ def supports(model: mjx.Model) -> bool:
         return False
     is_free = np.asarray(model.jnt_type) == mujoco.mjtJoint.mjJNT_FREE
     is_euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
-    if is_free.sum() != 1 or not is_free[-1] or not is_euler or model.npair * CONTACTS > LANES:
+    if is_free.sum() != 1 or not is_free[-1] or not is_euler or model.npair * CONTACTS_PER_PAIR > LANES:
         return False
     body = int(model.jnt_bodyid[-1])
     is_alone = model.body_jntnum[body] == 1 and body not in np.asarray(model.body_parentid)
@@ -204,9 +204,9 @@ def _free_body(model: mjx.Model, tree: ScalarModel) -> FreeBody:
 
 def _lane_contacts(model: mjx.Model, tree: ScalarModel) -> LaneContacts:
     """Return the contacts with arrays [32] as numbers."""
-    pair = np.minimum(np.arange(LANES) // CONTACTS, model.npair - 1)
-    is_used = np.arange(LANES) < model.npair * CONTACTS
-    number = np.arange(LANES) % CONTACTS
+    pair = np.minimum(np.arange(LANES) // CONTACTS_PER_PAIR, model.npair - 1)
+    is_used = np.arange(LANES) < model.npair * CONTACTS_PER_PAIR
+    number = np.arange(LANES) % CONTACTS_PER_PAIR
     geoms = np.asarray(model.pair_geom1), np.asarray(model.pair_geom2)
     _, frames = links.build_links(model)
     weight = np.asarray(model.body_invweight0, np.float64)[:, 0]

@@ -10,7 +10,7 @@ def in_own_block(compute: Callable[[Any], Any], inputs: Any, initial: Any) -> An
     """Call a function inside a loop of one iteration, which does not remain in the machine code.
 
     For each selection, Triton visits all operations that the selection depends on, up to the arguments of its block. Without
-    blocks in between, the hundreds of selections in a step had it visit the whole step as often, which was two thirds of the
+    blocks in between, it would visit the whole step for each of the hundreds of selections in it, which took two thirds of the
     time to compile the kernel.
 
     Args:

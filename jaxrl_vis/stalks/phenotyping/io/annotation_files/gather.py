@@ -70,7 +70,7 @@ def _read(folder: Path) -> list[tuple[Any, Annotated]]:
     broken = next((file for file in others if file.stem in images), None)
     if broken is not None:  # files with other names, such as a calibration, are allowed
         kinds = "Pascal VOC" if broken.suffix.lower() == ".xml" else "LabelMe"
-        raise RequestError(f"{broken} is no annotation of {kinds}, but called as an image is")
+        raise RequestError(f"{broken} is not an annotation of {kinds}, but has the name of an image")
     if not annotated:
         there = f" ({others[0].name} is none)" if others else ""
         raise RequestError(
@@ -98,7 +98,7 @@ def _convert_errors(file: Path, read: Any, format_name: str) -> Any:
     except OSError as error:
         raise RequestError(f"cannot read {file}: {error.strerror or error}") from error
     except _MALFORMED as error:
-        what = "not COCO: it needs images and annotations" if format_name == "COCO" else f"no annotation of {format_name}"
+        what = "not COCO: it needs images and annotations" if format_name == "COCO" else f"not an annotation of {format_name}"
         raise RequestError(f"{file} is {what}{_error_reason(error)}") from error
 
 

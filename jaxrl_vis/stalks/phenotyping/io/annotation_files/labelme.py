@@ -68,11 +68,11 @@ def _mask(shape: dict[str, Any], points: np.ndarray, size: tuple[int, int]) -> d
         raise ValueError("a mask that is not base64") from error
     shown = read_header_size(io.BytesIO(data))
     if shown is None or shown[0] * shown[1] > MAX_PIXELS:
-        raise ValueError("a mask that is no PNG")
+        raise ValueError("a mask that is not a PNG")
     if not 0 < size[0] * size[1] <= MAX_PIXELS or min(left, top) < 0 or left + shown[1] > size[0] or top + shown[0] > size[1]:
         raise ValueError("a mask that reaches beyond its image")
     plain = strip_png(data)
     mask = cv2.imdecode(np.frombuffer(plain, np.uint8), cv2.IMREAD_UNCHANGED) if plain else None
     if mask is None or mask.shape != shown:
-        raise ValueError("a mask that is no PNG")
+        raise ValueError("a mask that is not a PNG")
     return encode_mask(mask > 0, (top, left), (size[1], size[0]))

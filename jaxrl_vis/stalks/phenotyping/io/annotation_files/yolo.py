@@ -72,7 +72,7 @@ def read_yolo(path: Path, text: str, names: list[str], size: tuple[int, int]) ->
         else:
             raise ValueError(f"line {index + 1} has {len(values)} numbers")
         if not all(math.isfinite(coordinate) and -_BEYOND <= coordinate <= 1.0 + _BEYOND for coordinate in coordinates):
-            raise ValueError(f"line {index + 1} holds what is no share of an image")
+            raise ValueError(f"line {index + 1} holds something that is not a fraction of an image")
         if len(coordinates) == 4:
             x, y, wide, high = (coordinate * size[axis % 2] for axis, coordinate in enumerate(coordinates))
             annotations.append(from_box(name, [x - wide / 2, y - high / 2, wide, high], source))

@@ -27,7 +27,7 @@ def read_kitti(text: str, path: Path, image: Path | None) -> RectifiedPair:
     Args:
         text: Contents of the file.
         path: The file, for messages.
-        image: A left image, whose parent folders tell which pair it belongs to; None if unknown.
+        image: A left image, whose parent folders identify its pair; None if unknown.
 
     Raises:
         RequestError: The pair is missing or ambiguous, or a matrix or size is invalid.
@@ -38,7 +38,7 @@ def read_kitti(text: str, path: Path, image: Path | None) -> RectifiedPair:
         try:
             values = parse_numbers(rest)
         except ValueError as error:
-            raise RequestError(f"{path}: {name}{number} holds something that is no number") from error
+            raise RequestError(f"{path}: {name}{number} holds something that is not a number") from error
         if name == "S_rect_0":
             sizes[int(number)] = check_image_size((values + [0.0, 0.0])[:2], path, f"{name}{number}")
         elif len(values) != 12:

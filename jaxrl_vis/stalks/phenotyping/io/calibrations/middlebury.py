@@ -33,7 +33,7 @@ def read_middlebury(text: str, path: Path) -> RectifiedPair:
         size = check_image_size([float(values["width"]), float(values["height"])], path, "width and height")
     except (KeyError, ValueError) as error:
         raise RequestError(
-            f"{path} is a calib.txt of Middlebury, but cam0, cam1, doffs, baseline, width or height is missing or no number"
+            f"{path} is a calib.txt of Middlebury, but cam0, cam1, doffs, baseline, width or height is missing or not a number"
         ) from error
     if not abs(cameras[1][0, 2] - cameras[0][0, 2] - doffs) < 0.5:
         raise RequestError(

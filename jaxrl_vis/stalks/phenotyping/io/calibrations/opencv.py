@@ -76,11 +76,11 @@ def _coefficients(value: Any) -> np.ndarray:
 
 
 def _unit(store: dict[str, Any], path: Path) -> Unit | None:
-    said = store.get("unit")
-    if said is None:
+    stated_unit = store.get("unit")
+    if stated_unit is None:
         return None
     for unit in get_args(Unit):
-        if said == unit:
+        if stated_unit == unit:
             return unit
-    unit_read = reprlib.repr(said) if isinstance(said, str) else "something that is no text"
+    unit_read = reprlib.repr(stated_unit) if isinstance(stated_unit, str) else "something that is not text"
     raise RequestError(f"{path}: unit must be m, cm or mm, not {unit_read}")

@@ -41,13 +41,13 @@ def read_table(store: dict[str, Any], path: Path, size: Size | None) -> Rectifie
         )
     if size not in modes and not (size is None and len(modes) == 1):
         there = ", ".join(f"{wide} x {high}" for wide, high in modes)
-        asked = "your images" if size is None else f"images of {size[0]} x {size[1]}"
-        raise RequestError(f"{path} is of a RealSense camera, for {there}: it does not say which of them is for {asked}")
+        your_images = "your images" if size is None else f"images of {size[0]} x {size[1]}"
+        raise RequestError(f"{path} is of a RealSense camera, for {there}: it does not say which of them is for {your_images}")
     size = size or next(iter(modes))
     focal, x, y = modes[size]
     baseline = _number(store["baseline"])
     if baseline is None:
-        raise RequestError(f"{path} is of a RealSense camera, but its baseline is no number")
+        raise RequestError(f"{path} is of a RealSense camera, but its baseline is not a number")
     return RectifiedPair(projection_matrix(focal, x, y), projection_matrix(focal, x, y, -focal * abs(baseline)), size, "mm")
 
 

@@ -46,8 +46,8 @@ def read_settings(text: str, path: Path, size: Size | None) -> UnrectifiedPair:
         fitting = [mode for mode in modes if size in (None, _SIZES[mode])]
         if len(fitting) != 1:
             there = ", ".join(f"{_SIZES[mode][0]} x {_SIZES[mode][1]}" for mode in modes) or "no size that is known"
-            asked = "your images" if size is None else f"images of {size[0]} x {size[1]}"
-            raise RequestError(f"{path} is of a ZED camera, for {there}: it does not say which of them is for {asked}")
+            your_images = "your images" if size is None else f"images of {size[0]} x {size[1]}"
+            raise RequestError(f"{path} is of a ZED camera, for {there}: it does not say which of them is for {your_images}")
         mode = fitting[0]
         stereo, cameras = settings["STEREO"], [settings[f"{side}_CAM_{mode}"] for side in ("LEFT", "RIGHT")]
         matrices = [camera_matrix(*(float(camera[name]) for name in ("fx", "fy", "cx", "cy"))) for camera in cameras]
@@ -60,7 +60,7 @@ def read_settings(text: str, path: Path, size: Size | None) -> UnrectifiedPair:
         raise
     except (configparser.Error, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())[:100]
-        raise RequestError(f"{path} is of a ZED camera, but something of it is missing or no number ({reason})") from error
+        raise RequestError(f"{path} is of a ZED camera, but one of its values is missing or not a number ({reason})") from error
     if not all(map(math.isfinite, values)) or max(map(abs, values)) > 1e9:
         raise RequestError(f"{path} is of a ZED camera, but not all of its numbers are finite")
     rotation = cv2.Rodrigues(np.array(turns))[0]

@@ -1,4 +1,4 @@
-"""Names that tell the camera of a stereo pair: left and right, L and R, cam0 and cam1, infra1 and infra2, ..."""
+"""Names that identify the camera of a stereo pair: left and right, L and R, cam0 and cam1, infra1 and infra2, ..."""
 
 import re
 from collections.abc import Iterator

@@ -13,7 +13,7 @@ _UNIT_BY_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
 def parse_timestamp(stem: str) -> float | None:
     """Return the time in s at the end of a file name's stem; None if there is none.
 
-    A float64 resolves 0.2 microseconds of seconds since 1970.
+    A float64 resolves 0.2 microseconds in a number of seconds since 1970.
     """
     split = _SPLIT.search(stem)
     if split is not None:

@@ -23,9 +23,9 @@ def read_table_text(path: Path, max_bytes: int) -> str:
     except OSError as error:
         raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
-        raise RequestError(f"{path} is no table: save it as CSV in UTF-8 (is not UTF-8 text)") from error
+        raise RequestError(f"{path} is not a table: save it as CSV in UTF-8 (is not UTF-8 text)") from error
     except ValueError as error:
-        raise RequestError(f"{path} is no table: save it as CSV in UTF-8 ({error})") from error
+        raise RequestError(f"{path} is not a table: save it as CSV in UTF-8 ({error})") from error
 
 
 def split_cells(path: Path, text: str) -> tuple[list[str], list[tuple[int, list[str]]], bool]:
@@ -60,5 +60,5 @@ def split_cells(path: Path, text: str) -> tuple[list[str], list[tuple[int, list[
         columns = [unescape_cell(name.strip()).strip() for name in next(reader, [])]
         rows = [(first + reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except csv.Error as error:
-        raise RequestError(f"{path} is no table: save it as CSV in UTF-8 ({error})") from error
+        raise RequestError(f"{path} is not a table: save it as CSV in UTF-8 ({error})") from error
     return columns, rows, mark in ("\t", ";", " ")

@@ -51,7 +51,7 @@ def read_field_plan(path: Path, plots: Sequence[str]) -> tuple[list[str], dict[s
     small = [name.lower().replace(" ", "_") for name in columns]
     ids = [small.index(name) for name in _IDS if name in small]
     if not columns or len(set(small)) < len(small):
-        raise RequestError(f"{path} is no plan of a field: its first line must name columns, each once")
+        raise RequestError(f"{path} is not a field plan: its first line must name columns, each once")
     table = [
         [unescape_cell(row[place].strip()) if place < len(row) else "" for place in range(len(columns))] for _, row in rows
     ]
@@ -68,11 +68,11 @@ def read_field_plan(path: Path, plots: Sequence[str]) -> tuple[list[str], dict[s
     for plot, numbers in matched.items():
         values: dict[str, str] = {}
         for one in others:
-            said = {table[number][one] for number in numbers if table[number][one]}
-            if len(said) > 1 and len(numbers) < len(table):
-                both = " and ".join(sorted(said)[:2])
-                raise RequestError(f"{path} says two things of {columns[one]} of plot {readable(plot)}: {both}")
-            values[columns[one]] = said.pop() if len(said) == 1 else ""
+            distinct_values = {table[number][one] for number in numbers if table[number][one]}
+            if len(distinct_values) > 1 and len(numbers) < len(table):
+                both = " and ".join(sorted(distinct_values)[:2])
+                raise RequestError(f"{path} states two values of {columns[one]} for plot {readable(plot)}: {both}")
+            values[columns[one]] = distinct_values.pop() if len(distinct_values) == 1 else ""
         plan[plot] = values
     return [columns[one] for one in others], plan
 
@@ -118,9 +118,9 @@ def _match_by_range(columns: Sequence[str], table: Sequence[Sequence[str]], plot
     }
     matched = {}
     for plot in plots:
-        said = {word.lower(): str(int(number)) for word, number in re.findall(r"([A-Za-z]+)[ _-]*(\d{1,9})", plot)}
+        numbers = {word.lower(): str(int(number)) for word, number in re.findall(r"([A-Za-z]+)[ _-]*(\d{1,9})", plot)}
         for other in across:
-            key = (said.get("range", ""), other, said.get(other, said.get({"column": "col"}.get(other, other), "")))
+            key = (numbers.get("range", ""), other, numbers.get(other, numbers.get({"column": "col"}.get(other, other), "")))
             if key in rows and all(key):
                 matched[plot] = rows[key]
     return matched

@@ -200,7 +200,7 @@ def _parse_printed(path: Path, text: str) -> _Table | None:
             continue
         places = np.array([[float(number) for number in place.groups()] for _, place in rows])
         if not np.isfinite(places).all():
-            raise RequestError(f"{path} holds something that is no number: distances and times must be finite numbers")
+            raise RequestError(f"{path} holds something that is not a number: distances and times must be finite numbers")
         stamps = [int(stamp[1]) + int(stamp[2]) * 1e-9 for stamp, _ in rows if stamp is not None]
         times = np.array(stamps) - stamps[0] if len(stamps) == len(rows) else None
         metres = places if pattern is _PRINTED_PLACE else _project_to_plane(places)
@@ -221,8 +221,8 @@ def _parse_table(path: Path, text: str) -> _Table:
     places = next((names for names in (*_POSITIONS, *_GLOBE) if set(names[:2]) <= set(columns)), None)
     left = next((columns.index(name) for name in _LEFT if name in columns), None)
     if not metres and time is None and places is None:
-        said = next((name for name in columns if name in ("distance", "dist", "odometer")), None)
-        hint = f" (its column {said} does not say its unit)" if said else ""
+        unitless_column = next((name for name in columns if name in ("distance", "dist", "odometer")), None)
+        hint = f" (its column {unitless_column} does not state its unit)" if unitless_column else ""
         raise RequestError(f"{path} needs a column distance_m, or time_s and --speed{hint}")
 
     def column(index: int) -> np.ndarray:
@@ -263,7 +263,7 @@ def _parse_seconds(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarra
     largest = float(np.abs(values).max(initial=0.0))
     if match and match[1] == "s" and largest > _MAX_SECONDS:
         unit = "ns" if largest > 1e17 else "us" if largest > 1e14 else "ms"
-        raise RequestError(f"{path}: {name} holds {largest:.0f}, which are no seconds: name the column time_{unit} or mend it")
+        raise RequestError(f"{path}: {name} holds {largest:.0f}, too large for seconds: name the column time_{unit} or mend it")
     if match:
         factor = _SECONDS[match[1]]
     elif name in _ROS_TIMES:
@@ -303,6 +303,6 @@ def _parse_number(cell: str, path: Path, line: int, comma: bool) -> float:
     if not math.isfinite(value):
         shown = readable(text)[:40]
         raise RequestError(
-            f"{path} holds something that is no number in line {line} ('{shown}'): distances and times must be finite"
+            f"{path} holds something that is not a number in line {line} ('{shown}'): distances and times must be finite"
         )
     return value
