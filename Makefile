@@ -13,7 +13,7 @@ ARGS ?=
 RESULTS ?=
 WORKERS ?= 2
 EXAMPLES ?= 2000
-FUZZED := tests/readers/test_readers.py tests/readers/test_readers_of_runs.py tests/readers/test_reader_bounds.py tests/readers/test_laws.py
+FUZZED := tests/readers/test_readers.py tests/readers/test_readers_of_runs.py tests/readers/test_reader_bounds.py tests/readers/test_mathematical_properties.py
 PYTHON ?= >=3.11,<3.14
 
 # Evaluated once: `:=` would run them for `make help` too, so each sits in the recipe that needs it.

@@ -58,7 +58,7 @@ def test_each_reward_of_each_task_has_a_row_and_its_origin(tmp_path: Path) -> No
     assert text.endswith(f"{settings} Made by abcdef0 on A GPU.")
 
 
-def test_audits_with_other_settings_or_without_a_revision_are_told_apart() -> None:
+def test_audits_with_other_settings_or_without_a_revision_are_distinguished() -> None:
     table = audit.rows([record("VisualNear", "features"), record("VisualFar", "features", goals=8, revision=None)])
     text = " ".join(table.split())
     assert "VisualNear: 64 episodes, 32 goals with 128" in text and "VisualFar: 64 episodes, 8 goals with 128" in text

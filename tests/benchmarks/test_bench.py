@@ -75,7 +75,7 @@ def test_only_like_is_compared_with_like(now: dict, then: dict | None, why: str)
     assert line.endswith(f": {why})") and "not compared with 100 of" in line and "42 %" not in line
 
 
-def test_a_change_is_told_with_the_spread_of_the_repeats() -> None:
+def test_a_change_is_reported_with_the_spread_of_the_repeats() -> None:
     old, new = (record.to_record(measurement(value), idle_conditions(speed)) for value, speed in ((100.0, 1.0), (97.0, 0.95)))
     line = record.describe(new, old)
     assert "-3.0 % against 100 of" in line and line.endswith("the same machine at the same speed)")
@@ -145,7 +145,7 @@ def test_a_file_of_something_else_is_not_overwritten(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("contents", ["[{", '["a record"]', '{"schema": 1}'])
-def test_a_damaged_file_is_told_before_anything_is_measured(
+def test_a_damaged_file_is_reported_before_anything_is_measured(
     contents: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Otherwise the measurement would be lost, because it could not be stored."""

@@ -25,7 +25,7 @@ def archive(path: Path, files: dict[str, str], year: int = 2026) -> Path:
     return path
 
 
-def test_differences_are_told_file_by_file(tmp_path: Path) -> None:
+def test_differences_are_reported_file_by_file(tmp_path: Path) -> None:
     one = archive(tmp_path / "one.whl", {"a.py": "1", "b.py": "2"})
     assert list(verify_release.differences(one, archive(tmp_path / "same.whl", {"a.py": "1", "b.py": "2"}))) == []
     (changed,) = verify_release.differences(one, archive(tmp_path / "other.whl", {"a.py": "1", "b.py": "3"}))

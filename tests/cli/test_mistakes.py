@@ -58,7 +58,9 @@ def folder(here: Path) -> Path:
 
 
 @pytest.mark.parametrize(("mistake", "shown"), [row[:2] for row in ROWS], ids=[row[0] for row in ROWS])
-def test_each_mistake_is_told(mistake: str, shown: str, folder: Path, start: State, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_mistake_is_reported(
+    mistake: str, shown: str, folder: Path, start: State, capsys: pytest.CaptureFixture[str]
+) -> None:
     if mistake.startswith("jaxrl-vis "):
         command_line(mistake.split()[1:], shown, capsys)
     else:

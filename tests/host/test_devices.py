@@ -105,7 +105,7 @@ def test_sizes_are_all_in_one_unit() -> None:
 
 
 @pytest.mark.parametrize("variables", [{}, {"XLA_CLIENT_MEM_FRACTION": "0.5"}, {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.4"}])
-def test_training_claims_most_of_a_gpu_unless_told_how_much(variables: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_claims_most_of_a_gpu_unless_limited(variables: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")
     for name in names:
         monkeypatch.setenv(name, "")  # so that what is set here ends with the test

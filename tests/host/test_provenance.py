@@ -49,7 +49,7 @@ def test_no_checkout_has_no_revision(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert provenance.revision(folder=tmp_path) is None
 
 
-def test_a_copy_without_history_is_told_its_revision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_copy_without_history_is_reported_its_revision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("JAXRL_VIS_REVISION", "0123456789abcdef0123456789abcdef01234567-dirty")
     assert provenance.revision(folder=tmp_path) == "0123456789abcdef0123456789abcdef01234567-dirty"
     assert provenance.revision(12, tmp_path) == "0123456789ab-dirty"

@@ -76,7 +76,7 @@ def test_workers_look_for_no_window_system(monkeypatch):
     assert list(results.values()) == [{"glfw": False, "gl": "disable"}] * 2
 
 
-def test_what_goes_wrong_in_a_process_is_told():
+def test_what_goes_wrong_in_a_process_is_reported():
     results: dict[int, Record] = {}
     before = set(threading.enumerate())
     with pytest.raises(ValueError, match="number 2 is broken"):
@@ -116,7 +116,7 @@ def test_endless_numbers_are_taken_as_they_are_needed(workers: int):
     assert not set(multiprocessing.active_children()) - before
 
 
-def test_what_goes_wrong_with_endless_numbers_is_told():
+def test_what_goes_wrong_with_endless_numbers_is_reported():
     with pytest.raises(ValueError, match="number 2 is broken"):
         list(map_unordered(broken, itertools.count(), 2))
     with pytest.raises(WorkerError, match="was killed from outside"):
@@ -188,7 +188,7 @@ def test_a_file_goes_on_where_it_was_and_holds_one_evaluation(tmp_path: Path):
     assert 1 in in_memory and 2 not in in_memory
 
 
-def test_other_code_is_told_apart(tmp_path: Path):
+def test_other_code_is_distinguished(tmp_path: Path):
     package = ModuleType("package")
     package.__file__ = str(tmp_path / "__init__.py")
     (tmp_path / "training").mkdir()

@@ -101,7 +101,7 @@ def test_seeds_of_which_each_device_gets_some_may_be_of_any_batch_size() -> None
 
 
 @pytest.mark.parametrize("words", [["--devices", "2"], ["--devices", "two"]])
-def test_devices_that_are_not_there_are_told_in_one_line(
+def test_devices_that_are_not_there_are_reported_in_one_line(
     words: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"

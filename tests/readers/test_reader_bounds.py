@@ -73,7 +73,7 @@ def test_odometry_finds_images_whose_names_are_not_utf8(tmp_path):
     assert read_odometry(plot) == {"000_tété": 0.25}
 
 
-def test_names_that_are_too_long_are_told(tmp_path, capsys):
+def test_names_that_are_too_long_are_reported(tmp_path, capsys):
     long = "x" * 300
     for words in (["phenotype", "run", long], ["grasp", "run", long], ["eval", long], ["train", "Reacher", "--run-dir", long]):
         assert cli.main(words) == 2
@@ -95,7 +95,7 @@ def test_names_that_are_too_long_are_told(tmp_path, capsys):
         ((f"left_{LATIN}.png", "left_tété.png", "right_tété.png"), "both the left image of pair tété"),
     ],
 )
-def test_pairs_of_one_name_are_told(tmp_path, names, told):
+def test_pairs_of_one_name_are_reported(tmp_path, names, told):
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
@@ -264,7 +264,7 @@ def test_annotations_of_labelme_that_are_none(worker, text, part):
     refused(worker, "labelme", {"a.json": text.encode()}, part)
 
 
-def test_two_images_of_one_id_are_told(tmp_path):
+def test_two_images_of_one_id_are_reported(tmp_path):
     image = {"id": 1, "file_name": "a.png", "width": 4, "height": 4}
     data = {"images": [image, {**image, "file_name": "b.png"}], "annotations": [{"image_id": 1, "bbox": [0, 0, 1, 1]}]}
     (tmp_path / "annotations.json").write_text(json.dumps(data))
@@ -328,7 +328,7 @@ def test_weights_are_checked_before_a_network_is_built(worker, data, part):
     ("kind", "part"),
     [("shape", "is not"), ("type", "is not"), ("name", "is missing or too many"), ("value", "not finite")],
 )
-def test_arrays_that_are_not_those_of_the_network_are_told(tmp_path, kind, part):
+def test_arrays_that_are_not_those_of_the_network_are_reported(tmp_path, kind, part):
     with weights_file.safetensors.safe_open(painter.SHIPPED, "numpy") as file:
         about, arrays = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
     name = min(name for name in arrays if name.endswith("bias"))

@@ -32,7 +32,7 @@ def test_there_must_be_a_folder_of_plots(tmp_path):
         find_plots(tmp_path / "nowhere")
 
 
-def test_two_plots_that_read_alike_are_told(tmp_path):
+def test_two_plots_that_read_alike_are_reported(tmp_path):
     for plot in ("a\x01", "a\x02"):
         touch(tmp_path, f"{plot}/left_0.png", f"{plot}/right_0.png")
     with pytest.raises(RequestError, match="holds two plots called a_: rename one of them"):
@@ -79,12 +79,12 @@ def test_rows_of_odometry_are_those_of_pairs(tmp_path):
         ("distance_m\n" + "1" * 200_000, "is not a table: save it as CSV in UTF-8"),
     ],
 )
-def test_odometry_that_cannot_be_used_is_told(tmp_path, table, told):
+def test_odometry_that_cannot_be_used_is_reported(tmp_path, table, told):
     with pytest.raises(RequestError, match=re.escape(told)):
         odometry(tmp_path, table)
 
 
-def test_odometry_that_cannot_be_read_is_told(tmp_path):
+def test_odometry_that_cannot_be_read_is_reported(tmp_path):
     (tmp_path / "odometry.csv").mkdir()
     with pytest.raises(RequestError, match="cannot read .*odometry.csv: "):
         read_odometry(PlotFolder("plot", tmp_path, ()))
@@ -109,7 +109,7 @@ GREY = np.arange(240, dtype=np.uint8).reshape(12, 20)
         ("a.png", b"", "is not an image, or only a part of one"),
     ],
 )
-def test_images_that_cannot_be_used_are_told(tmp_path, name, data, told):
+def test_images_that_cannot_be_used_are_reported(tmp_path, name, data, told):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(OSError, match=f"{name} {told}"):
         read_image(tmp_path / name)
@@ -171,19 +171,19 @@ def test_boxes_are_those_around_outlines_and_masks(tmp_path):
         ({"bbox": [1, 2, 3, 4]}, {"width": 10**9}, "image a.png is said to have 1e+09 x 12, more than"),
     ],
 )
-def test_annotations_that_cannot_be_used_are_told(tmp_path, annotation, image, told):
+def test_annotations_that_cannot_be_used_are_reported(tmp_path, annotation, image, told):
     with pytest.raises(RequestError, match=re.escape(told)):
         coco(tmp_path, annotation, **image)
 
 
-def test_an_annotation_without_an_image_id_is_told(tmp_path):
+def test_an_annotation_without_an_image_id_is_reported(tmp_path):
     data = {"images": [{"id": 1, "file_name": "a.png", **SIZE}], "annotations": [{"id": 5, "bbox": [1, 2, 3, 4]}]}
     (tmp_path / "annotations.json").write_text(json.dumps(data))
     with pytest.raises(RequestError, match="annotation 5 has no image_id: mend it, or delete it"):
         read_annotations(tmp_path)
 
 
-def test_annotations_that_are_not_there_or_cannot_be_read_are_told(tmp_path):
+def test_annotations_that_are_not_there_or_cannot_be_read_are_reported(tmp_path):
     for folder in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(RequestError, match="there are no annotations in "):
             read_annotations(folder)
@@ -193,7 +193,7 @@ def test_annotations_that_are_not_there_or_cannot_be_read_are_told(tmp_path):
             read_annotations(tmp_path)
 
 
-def test_shapes_of_labelme_that_enclose_nothing_are_told(tmp_path):
+def test_shapes_of_labelme_that_enclose_nothing_are_reported(tmp_path):
     shapes = [
         {"label": "stalk", "points": [[1, 2], [3, 2], [3, 5]]},
         {"label": "stalk", "points": [[1, 2], [3, 2]]},
@@ -213,7 +213,7 @@ def test_shapes_of_labelme_that_enclose_nothing_are_told(tmp_path):
 
 # --- weights ---
 @pytest.mark.parametrize("data", [b"", b"\x02", b"\x01" + bytes(7) + b"{}", b"\x03" + bytes(7) + b"{}", b"\xff" * 16])
-def test_weights_whose_header_cannot_be_one_are_told(tmp_path, data):
+def test_weights_whose_header_cannot_be_one_are_reported(tmp_path, data):
     (tmp_path / "w.safetensors").write_bytes(data)
     with pytest.raises(RequestError, match=r"w.safetensors holds no weights: name a file that `train` wrote"):
         weights_file.read_parameters(
@@ -221,7 +221,7 @@ def test_weights_whose_header_cannot_be_one_are_told(tmp_path, data):
         )
 
 
-def test_weights_that_are_a_folder_are_told(tmp_path):
+def test_weights_that_are_a_folder_are_reported(tmp_path):
     with pytest.raises(RequestError, match="holds no weights"):
         weights_file.read_parameters(tmp_path, "train", lambda about: pytest.fail("it was asked what it holds"))
     with pytest.raises(RequestError, match="cannot read the weights .*none.safetensors: No such file"):

@@ -38,14 +38,14 @@ def hold(worker: Worker, name: str, files: st.SearchStrategy[Files], refuses: bo
     tally: Counter[str] = Counter()
 
     @given(files)
-    def law(files: Files) -> None:
+    def check_property(files: Files) -> None:
         outcome = worker.read(name, files)
         tally.update(["all", outcome.kind, *(["parsed"] if outcome.parsed else [])])
         event(f"{name}: {outcome.kind}{', past the parser' if outcome.parsed else ''}")
         assert outcome.kind != "fault", outcome.text
         assert outcome.seconds < SECONDS and outcome.megabytes < MEGABYTES, outcome
 
-    law()
+    check_property()
     print(f"{name}: {tally['all']} examples, {tally['parsed']} past the parser, {tally['value']} values")
     assert 3 * tally["parsed"] >= tally["all"]
     assert tally["value"] > 0 and (tally["refused"] > 0 or not refuses)

@@ -46,7 +46,7 @@ def test_manifests_of_checkpoints(states, saved):  # noqa: F811
 
     @settings(max_examples=max(settings().max_examples // 4, 1))  # each of them opens the folder of checkpoints
     @given(also_as_text(trees(valid, 2).map(json_text), json_text(valid)))
-    def law(data):
+    def check_property(data):
         file.write_bytes(data)
         lines: list[str] = []
         try:
@@ -59,5 +59,5 @@ def test_manifests_of_checkpoints(states, saved):  # noqa: F811
             tally[str(restored.iteration)] += 1
         assert all(len(line.splitlines()) == 1 for line in lines)
 
-    law()
+    check_property()
     assert tally["2"] and tally["3"], tally

@@ -67,7 +67,7 @@ def test_the_gallery_shows_start_and_goals(own_environment: str, tmp_path: Path)
         assert (windows == image).all(axis=(2, 3, 4)).any()
 
 
-def test_what_the_gallery_cannot_draw_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_the_gallery_cannot_draw_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for tokens, word in (
         (["--env", "Reacher", "--gallery", str(tmp_path / "x.png")], "VisualReacher"),
         (["--env", "VisualReacher", "--gallery", str(tmp_path / "x.txt")], ".png"),

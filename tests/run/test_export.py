@@ -246,7 +246,7 @@ def test_another_policy_does_not_pass(
 
 
 @pytest.mark.parametrize("kind", FORMATS_HERE)
-def test_a_damaged_file_is_told_in_one_line(kind: str, copied: Any) -> None:
+def test_a_damaged_file_is_reported_in_one_line(kind: str, copied: Any) -> None:
     folder = copied(kind)
     file = folder / FORMATS[kind]
     whole = file.read_bytes()
@@ -261,7 +261,7 @@ def test_a_damaged_file_is_told_in_one_line(kind: str, copied: Any) -> None:
 
 
 @pytest.mark.parametrize("kind", FORMATS_HERE)
-def test_a_contract_or_frames_that_do_not_fit_are_told(kind: str, copied: Any, exported: dict) -> None:
+def test_a_contract_or_frames_that_do_not_fit_are_reported(kind: str, copied: Any, exported: dict) -> None:
     folder = copied(kind)
     shutil.copy(exported["Told", kind] / "contract.json", folder)
     with pytest.raises(RequestError, match="golden.npz has no 32 frames|golden.npz: observation is"):
@@ -300,7 +300,7 @@ def test_only_an_exported_policy_is_overwritten(copied: Any, runs: dict, tmp_pat
             export_run(runs["VisualTold"], "stablehlo", out, overwrite=True)
 
 
-def test_a_wrong_request_is_told_in_one_line(
+def test_a_wrong_request_is_reported_in_one_line(
     runs: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = str(runs["Told"])

@@ -152,7 +152,7 @@ def test_viser_shows_the_page_to_this_machine_alone(session: live.Session, tmp_p
         real.stop()
 
 
-def test_a_full_disk_is_told_on_the_page(server: Server, page: live.Page, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_on_the_page(server: Server, page: live.Page, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 

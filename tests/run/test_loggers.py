@@ -189,7 +189,7 @@ def test_a_signal_saves_first_and_closes_the_loggers(tmp_path: Path) -> None:
     assert_shown(path, 0, "eval/success")
 
 
-def test_what_cannot_be_is_told_before_any_work(
+def test_what_cannot_be_is_reported_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     where = ["--preset", "debug", "--run-dir", str(tmp_path / "run")]

@@ -50,7 +50,7 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("kind", DAMAGED)
-def test_a_damaged_line_is_kept_aside_and_told(tmp_path, kind):
+def test_a_damaged_line_is_kept_aside_and_reported(tmp_path, kind):
     path, aside = tmp_path / "metrics.jsonl", tmp_path / "damaged" / "metrics.jsonl"
     rows = [row(1), row(3)]
     path.write_bytes(b"%s\n%s\n%s\n" % (json.dumps(rows[0]).encode(), DAMAGED[kind], json.dumps(rows[1]).encode()))
@@ -62,7 +62,7 @@ def test_a_damaged_line_is_kept_aside_and_told(tmp_path, kind):
 
 
 @pytest.mark.parametrize("torn", [b'{"seed": 0, "iter', b'{"seed": 0, "eval/\xc3', b"\0" * 50])
-def test_what_a_kill_has_left_of_the_last_line_is_not_told(tmp_path, torn):
+def test_what_a_kill_has_left_of_the_last_line_is_not_reported(tmp_path, torn):
     path = tmp_path / "metrics.jsonl"
     metrics.append_rows(path, [row(1)])
     path.write_bytes(path.read_bytes() + torn)
@@ -114,7 +114,7 @@ def test_a_finished_run_that_lost_its_last_row_is_evaluated_again(straight, tmp_
 
 
 @pytest.mark.parametrize(("env_steps", "number"), [(60, 5), (60, 6), (80, 5)])
-def test_a_torn_last_row_that_was_whole_is_kept_aside_and_told(tmp_path, capsys, env_steps, number):
+def test_a_torn_last_row_that_was_whole_is_kept_aside_and_reported(tmp_path, capsys, env_steps, number):
     path = tmp_path / "run"
     list(make_fake_trainer(small_config(env_steps=60), path).run())
     file = path / "metrics.jsonl"

@@ -122,7 +122,7 @@ def test_another_metric_begins_anew_and_overwriting_deletes(make: Callable[..., 
     assert best(path) == [] and not (path / "checkpoints" / BEST).exists()
 
 
-def test_a_damaged_best_is_told_and_replaced(
+def test_a_damaged_best_is_reported_and_replaced(
     straight: Path, make: Callable[..., Trainer], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, made = tmp_path / "run", make(None)
@@ -200,7 +200,7 @@ def test_a_level_that_is_not_a_success_rate_is_refused() -> None:
 # -- Callbacks
 
 
-def test_callbacks_are_told_of_evaluations_and_may_stop(make: Callable[..., Trainer], tmp_path: Path) -> None:
+def test_callbacks_receive_evaluations_and_may_stop(make: Callable[..., Trainer], tmp_path: Path) -> None:
     told, others, path = [], [], tmp_path / "run"
 
     def stop_after_six(report: Any) -> bool:

@@ -131,7 +131,7 @@ def test_a_checkpoint_can_be_chosen(runs: dict[str, Path], tmp_path: Path) -> No
         ("Told", np.zeros((1,), np.uint8), "must be float32, not uint8"),
     ],
 )
-def test_a_wrong_input_is_told_in_one_line(
+def test_a_wrong_input_is_reported_in_one_line(
     name: str, observation: np.ndarray, words: str, policies: dict[str, jaxrl_vis.Policy]
 ) -> None:
     policy = policies[name]
@@ -143,7 +143,7 @@ def test_a_wrong_input_is_told_in_one_line(
             assert f"{name}: {which} must" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_run_that_cannot_be_used_is_told_in_one_line(runs: dict[str, Path], tmp_path: Path) -> None:
+def test_a_run_that_cannot_be_used_is_reported_in_one_line(runs: dict[str, Path], tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="no run in"):
         jaxrl_vis.load_policy(tmp_path)
     with pytest.raises(RequestError, match="has trained no seed 0, only seeds 3 to 4"):

@@ -116,7 +116,7 @@ def test_overwriting_empties_what_a_link_leads_to_and_keeps_the_link(tmp_path):
     assert checkpoints_in(path) == ["full/2", "light/2"] and not (path / "checkpoints").is_symlink()
 
 
-def test_what_cannot_be_deleted_is_told_before_a_new_run_starts(straight, tmp_path, monkeypatch):
+def test_what_cannot_be_deleted_is_reported_before_a_new_run_starts(straight, tmp_path, monkeypatch):
     path = Path(shutil.copytree(straight[0], tmp_path / "run"))
     rmtree = shutil.rmtree
 
@@ -145,7 +145,7 @@ def error_of_moved_run(trainer, iteration: int, act) -> StorageError:
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="other systems do not say where a folder went")
-def test_a_folder_that_is_moved_is_told_where_it_is_and_goes_on_there(straight, tmp_path):
+def test_a_folder_that_is_moved_is_reported_where_it_is_and_goes_on_there(straight, tmp_path):
     old, new = tmp_path / "old", tmp_path / "new"
     config = small_config(full_checkpoint_interval=4, checkpoint_interval=4)
     error = error_of_moved_run(make_fake_trainer(config, old), 5, lambda: old.rename(new))

@@ -307,7 +307,7 @@ def test_signals_that_repeat_themselves_do_not_hurry_a_save(tmp_path, not_ignore
     assert Checkpoints(path / "checkpoints", read_only=True).iterations(FULL)[-1] >= 3
 
 
-def test_a_signal_after_the_last_iteration_is_told(tmp_path, capsys, monkeypatch, not_ignored):
+def test_a_signal_after_the_last_iteration_is_reported(tmp_path, capsys, monkeypatch, not_ignored):
     trainer = make_fake_trainer(small_config(), tmp_path / "run")
     finish = Checkpoints.wait
 

@@ -282,7 +282,7 @@ def test_a_program_under_another_ones_name_is_not_used(folder, kept):
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "empty"])
-def test_a_damaged_entry_of_xlas_cache_is_mended_and_not_told(tmp_path, recwarn, damage):
+def test_a_damaged_entry_of_xlas_cache_is_mended_and_not_reported(tmp_path, recwarn, damage):
     before = (jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs)
 
     def compile_anew() -> None:

@@ -117,7 +117,7 @@ def test_a_non_finite_number_stops_the_run(tmp_path, break_state, capsys):
     assert restored.iteration == 4 and all(np.isfinite(leaf).all() for leaf in as_plain(restored.train))
 
 
-def test_numbers_that_the_simulation_made_are_told_from_those_of_the_learner(tmp_path):
+def test_numbers_that_the_simulation_made_are_distinguished_from_those_of_the_learner(tmp_path):
     with pytest.raises(trainer.NonFiniteError, match="not from the learner .achieved_state of environment 0"):
         list(make_fake_trainer(small_config(), tmp_path / "simulated", nan_at=4, break_state=True).run())
     with pytest.raises(trainer.NonFiniteError) as stopped:

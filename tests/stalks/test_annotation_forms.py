@@ -237,7 +237,7 @@ def test_classes_of_yolo_without_names_are_numbers(tmp_path):
 
 # --- shapes ---
 @pytest.mark.parametrize("kind", ["line", "linestrip", "point", "circle"])
-def test_shapes_without_a_width_are_told_of_stalks_and_of_nothing_else(tmp_path, kind):
+def test_shapes_without_a_width_are_reported_of_stalks_and_of_nothing_else(tmp_path, kind):
     put(tmp_path, {"r.json": labelme("r.png", ("polygon", kind))}, "r.png")
     with pytest.raises(RequestError, match=rf"r.json: annotation 2 is a {kind}, which has no width: draw it as a polygon"):
         read_annotations(tmp_path)
@@ -310,7 +310,7 @@ def test_files_of_several_forms_are_read_together(tmp_path):
         ({"notes.txt": "hello", "plot.json": "{}"}, ["r.png"], "(plot.json is none): put annotations.json of COCO there"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_read_is_told_in_one_line(tmp_path, files, images, part):
+def test_what_cannot_be_read_is_reported_in_one_line(tmp_path, files, images, part):
     with pytest.raises(RequestError) as error:
         read_annotations(put(tmp_path, files, *images), ("stalk", "1"))
     assert part in str(error.value) and len(str(error.value).splitlines()) == 1

@@ -287,7 +287,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_serve_is_told_in_one_line(tmp_path, case):
+def test_what_cannot_serve_is_reported_in_one_line(tmp_path, case):
     files, size, part = REFUSED[case]
     path = put(tmp_path / "rig", files)
     path = path / next(iter(files)) if len(files) == 1 else path

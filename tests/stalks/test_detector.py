@@ -307,7 +307,7 @@ def test_a_loss_that_is_not_finite_stops_the_training():
         train([iter([drawing(0), drawing(1)])], TINY, plan, lambda *rest: None, report_interval=0.0)
 
 
-def test_a_training_without_time_for_an_update_is_told():
+def test_a_training_without_time_for_an_update_is_reported():
     plan = Plan(minutes=1e-9, images=2, first=2, batch=4, crops=4)
     with pytest.raises(RequestError, match="before the first update: allow more with --minutes"):
         train([iter([drawing(0), drawing(1)])], TINY, plan, lambda *rest: None)
@@ -349,7 +349,7 @@ def test_crops_are_varied_and_their_masks_stay_with_them():
     assert widths.min() < 14 and widths.max() > 18
 
 
-def test_what_fails_to_make_examples_is_told():
+def test_what_fails_to_make_examples_is_reported():
     def broken():
         yield drawing(0)
         raise RequestError("no such image")

@@ -170,7 +170,7 @@ def test_ranges_and_rows_name_plots(tmp_path):
         ("plot_id,genotype\nplot_0001,A\nplot_0001,B\nplot_0002,B\n", "two values of genotype for plot field 1/plot_0001: A"),
     ],
 )  # fmt: skip
-def test_plans_that_cannot_be_joined_are_told_in_one_line(tmp_path, text, part):
+def test_plans_that_cannot_be_joined_are_reported_in_one_line(tmp_path, text, part):
     (tmp_path / "plan.csv").write_text(text)
     with pytest.raises(RequestError) as error:
         read_field_plan(tmp_path / "plan.csv", PLOTS)

@@ -90,7 +90,7 @@ def test_images_of_other_views_get_the_lines_that_networks_know(lines, kept, add
         (678.0, (1055, 400), 0.8, "show 0.47 m from top to bottom"),
     ],
 )
-def test_lenses_that_were_not_tried_are_told(focal, size, distance, told):
+def test_lenses_that_were_not_tried_are_reported(focal, size, distance, told):
     """Resolution and field of view at the plants decide, whatever camera or distance they result from."""
     width, height = size
     camera = Calibration(width, height, focal, (0.5 * (width - 1), 0.5 * (height - 1)), 0.1)
@@ -273,7 +273,7 @@ def test_images_are_turned_as_viewers_turn_them(tmp_path, suffix, orientation):
     np.testing.assert_allclose(read_image(path).astype(int), wanted.astype(int), atol=3)
 
 
-def test_pairs_upside_down_are_told():
+def test_pairs_upside_down_are_reported():
     left, right, camera = sample()
     assert pair_fault([], [], left, right, camera) is None
     turned = [np.ascontiguousarray(image[::-1, ::-1]) for image in (left, right)]
@@ -283,7 +283,7 @@ def test_pairs_upside_down_are_told():
 
 
 @pytest.mark.parametrize(("baseline", "distance"), [(0.01, "0.08"), (1.0, "8"), (0.0417, "0.33")])
-def test_a_row_that_stands_nowhere_is_told(baseline, distance):
+def test_a_row_that_stands_nowhere_is_reported(baseline, distance):
     """Baselines are wrong by the unit of the chessboard: ten times, a tenth, and squares of 24 mm taken for 1 cm."""
     left, right, finds = stalks_at(68)
     wrong = dataclasses.replace(CAMERA, baseline=baseline)

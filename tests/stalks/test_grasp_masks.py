@@ -88,7 +88,7 @@ def test_training_tells_what_goes_wrong():
         train([iter([striped(0)])], settings, dataclasses.replace(plan, minutes=1e-9), lambda *parts: None)
 
 
-def test_files_that_hold_no_masks_are_told(tmp_path):
+def test_files_that_hold_no_masks_are_reported(tmp_path):
     with pytest.raises(RequestError, match="cannot read the weights"):
         read_weights(tmp_path / "missing.safetensors")
     (tmp_path / "text.safetensors").write_text("no weights")

@@ -89,7 +89,7 @@ def test_run_finds_the_stalks_and_goes_on_where_it_was(runs, tmp_path, capsys):
     assert "holds the results of another request" in capsys.readouterr().err
 
 
-def test_missing_pairs_and_missing_odometry_are_told_and_the_run_goes_on(runs, tmp_path, capsys):
+def test_missing_pairs_and_missing_odometry_are_reported_and_the_run_goes_on(runs, tmp_path, capsys):
     folder = tmp_path / "runs"
     shutil.copytree(runs, folder)
     (folder / "plot_0000" / "right_001.png").unlink()
@@ -114,7 +114,7 @@ def test_missing_pairs_and_missing_odometry_are_told_and_the_run_goes_on(runs, t
     assert row["flag"] == "no usable pairs" and row["grasp_points"] == "0"
 
 
-def test_clouds_that_do_not_stitch_and_an_arm_that_reaches_nothing_are_told(runs, tmp_path):
+def test_clouds_that_do_not_stitch_and_an_arm_that_reaches_nothing_are_reported(runs, tmp_path):
     folder = tmp_path / "plot_0000"
     shutil.copytree(runs / "plot_0000", folder)
     text = (folder / "odometry.csv").read_text().splitlines()

@@ -119,7 +119,7 @@ def test_what_is_refused_fails_in_every_total_and_is_not_a_reach():
     assert thesis_ratio(attempts) == (1.0, 1)
 
 
-def test_collisions_and_false_targets_are_told_apart_from_success():
+def test_collisions_and_false_targets_are_distinguished_from_success():
     attempts = [Attempt(0, 0, held(0), collided=True), Attempt(0, None, held()), Attempt(0, 1, held(1), brushed=True)]
     found = score(attempts, [stand(0), stand(1)])
     assert (found.collisions.count, found.collisions.total) == (1, 3)

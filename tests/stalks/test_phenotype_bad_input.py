@@ -47,7 +47,7 @@ def test_bad_files_are_listed_and_skipped(plots, tmp_path, capsys):
     assert "skipped plot_0000/000: there is no right image" in capsys.readouterr().err
 
 
-def test_swapped_and_unrectified_pairs_are_told():
+def test_swapped_and_unrectified_pairs_are_reported():
     """The right image of six textured stalks is unchanged, exchanged for the left one, too low, and too high."""
     rng = np.random.default_rng(0)
     camera = Calibration(844, 400, 542.0, (421.5, 199.5), 0.1)
@@ -90,7 +90,7 @@ def test_without_calibration_no_millimetres_and_without_odometry_no_count(plots,
     assert "no millimetres" in capsys.readouterr().err
 
 
-def test_black_images_and_calibrations_of_another_size_are_told(plots, tmp_path):
+def test_black_images_and_calibrations_of_another_size_are_reported(plots, tmp_path):
     plot = tmp_path / "plot_0000"
     shutil.copytree(plots / "plot_0000", plot)
     write_image(plot / "left_000.png", np.zeros((338, 422, 3), np.uint8))
@@ -202,7 +202,7 @@ def test_odometry_that_contradicts_the_images_gives_no_count(plots, results, tmp
     assert "plot_0000: odometry does not fit the images (its distances, or the baseline of the calibration, may" in told
 
 
-def test_stalks_without_a_single_width_are_told(plots, results, tmp_path, capsys):
+def test_stalks_without_a_single_width_are_reported(plots, results, tmp_path, capsys):
     """A plot is flagged if, by the records of its pairs, no stalk could be measured."""
     out = tmp_path / "out"
     shutil.copytree(results, out)

@@ -166,7 +166,7 @@ RUNS = encode_mask(np.ones((40, 10), bool), (4, 10), IMAGE)
         ({"bbox": BOX, "segmentation": {**RUNS, "counts": [3840]}}, "has a mask without a pixel"),
     ],
 )
-def test_what_is_wrong_with_an_annotation_is_told_with_its_number(tmp_path, annotation, part):
+def test_what_is_wrong_with_an_annotation_is_reported_with_its_number(tmp_path, annotation, part):
     with pytest.raises(RequestError) as error:
         read_annotations(coco_folder(tmp_path, annotation))
     message = str(error.value)
@@ -182,7 +182,7 @@ def test_what_is_wrong_with_an_annotation_is_told_with_its_number(tmp_path, anno
         ({"file_name": None}, "image number 1 needs an id and a file_name"),
     ],
 )
-def test_what_is_missing_of_an_image_is_told(tmp_path, image, part):
+def test_what_is_missing_of_an_image_is_reported(tmp_path, image, part):
     with pytest.raises(RequestError) as error:
         read_annotations(coco_folder(tmp_path, {"bbox": BOX}, image))
     assert part in str(error.value) and "annotations.json" in str(error.value)

@@ -314,7 +314,7 @@ def test_images_survive_files(tmp_path, suffix):
 
 @pytest.mark.parametrize("kind", ["int8", "int16", "int32", "float32", "float64"])
 @pytest.mark.parametrize("shape", [(4, 5), (4, 5, 3)])
-def test_images_of_other_numbers_are_told(tmp_path, kind, shape):
+def test_images_of_other_numbers_are_reported(tmp_path, kind, shape):
     """The error is one line, both as text and as ``strerror``, which is printed after the name of the file elsewhere."""
     path = tmp_path / "a.tiff"
     assert cv2.imwrite(str(path), np.ones(shape, kind))

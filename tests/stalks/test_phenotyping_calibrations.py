@@ -119,7 +119,7 @@ def test_cameras_above_each_other_are_refused(tmp_path):
         (dict(baseline=1e5), "not that of a stereo pair"),
     ],
 )
-def test_bad_calibrations_are_told_in_one_line(tmp_path, arguments, part):
+def test_bad_calibrations_are_reported_in_one_line(tmp_path, arguments, part):
     with pytest.raises(RequestError) as error:
         read_calibration(matrices(tmp_path / "bad.yaml", **arguments))
     assert part in str(error.value) and "bad.yaml" in str(error.value)

@@ -92,7 +92,7 @@ def test_where_names_do_not_say_it_the_user_is_asked(tmp_path, names, part):
     assert part in str(error.value) and len(str(error.value).splitlines()) == 1
 
 
-def test_images_that_show_both_sides_are_told(tmp_path):
+def test_images_that_show_both_sides_are_reported(tmp_path):
     cv2.imwrite(str(tmp_path / "IMG_0001.png"), np.zeros((20, 60), np.uint8))
     with pytest.raises(RequestError, match="IMG_0001.png is 60 x 20: if it shows both sides, cut it"):
         find_plots(tmp_path)

@@ -148,7 +148,7 @@ def test_images_of_every_encoding(tmp_path, encoding):
         np.testing.assert_array_equal(image, wanted)
 
 
-def test_raw_images_and_several_pairs_are_told(tmp_path):
+def test_raw_images_and_several_pairs_are_reported(tmp_path):
     raw = ("/left/image_raw", "/right/image_raw")
     with pytest.raises(RequestError, match="/left/image_raw has raw images, which its camera_info says are distorted"):
         extract_recording(write(tmp_path / "raw.bag", 1, topics=raw, distortion=0.1), tmp_path)
@@ -175,7 +175,7 @@ def _two_rigs(path: Path, topics: tuple[str, ...]) -> Path:
         PLAIN = both
 
 
-def test_encodings_that_cannot_be_read_are_told(tmp_path):
+def test_encodings_that_cannot_be_read_are_reported(tmp_path):
     with pytest.raises(RequestError, match="images are encoded as yuv422; mono8"):
         extract_recording(write(tmp_path / "row.bag", 1, "yuv422"), tmp_path)
 

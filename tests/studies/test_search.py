@@ -67,7 +67,7 @@ def scored(runs: Path) -> dict[int, Any]:
     return {trial.number: trial for trial in optuna.load_study(study_name="search", storage=storage).trials}
 
 
-def test_two_trials_are_trained_and_the_best_is_told(tmp_path: Path) -> None:
+def test_two_trials_are_trained_and_the_best_is_reported(tmp_path: Path) -> None:
     script = Script()
     is_done, said = search(request(tmp_path), script)
     assert is_done and [family for family, _ in script.calls] == ["trial-0", "trial-1"]
@@ -94,7 +94,7 @@ def test_a_trial_that_was_interrupted_goes_on_with_its_values(tmp_path: Path) ->
     assert [trial.state.name for trial in scored(tmp_path).values()] == ["COMPLETE", "COMPLETE"]
 
 
-def test_failed_trials_are_told_and_left_out(tmp_path: Path) -> None:
+def test_failed_trials_are_reported_and_left_out(tmp_path: Path) -> None:
     is_done, said = search(request(tmp_path, best_by="goal_distance"), Script(**{"trial-0": "fails"}))
     assert is_done and any("trial-0-300: failed with exit status 1" in line for line in said)
     assert "1 of 2 trials done, 1 failed" in said and any("goal_distance" in line for line in said)
@@ -138,7 +138,7 @@ def test_another_search_is_refused(tmp_path: Path) -> None:
         ("encoders=a..b", "encoders is not a number: list its values"),
     ],
 )
-def test_ranges_that_cannot_be_are_told_in_one_line(text: str, words: str) -> None:
+def test_ranges_that_cannot_be_are_reported_in_one_line(text: str, words: str) -> None:
     with pytest.raises(RequestError, match=words):
         read_range(text)
 

@@ -102,7 +102,7 @@ def test_what_is_missing_is_trained_what_is_begun_goes_on_and_what_is_there_stay
     assert run_cells(cells, runs, lambda: pytest.fail("asked for devices"), command=none) == [] and not none.calls
 
 
-def test_a_cell_that_fails_is_told_in_one_line_and_the_others_go_on(tmp_path: Path) -> None:
+def test_a_cell_that_fails_is_reported_in_one_line_and_the_others_go_on(tmp_path: Path) -> None:
     cells = [make_cell("a"), make_cell("b")]
     failures, said = run(cells, tmp_path, Script(a="fails"))
     (line,) = failures
@@ -229,7 +229,7 @@ def test_a_folder_with_another_run_is_refused_before_anything_starts(tmp_path: P
 
 
 @pytest.mark.parametrize("contents", ['{"schema": ', '{"schema": 99}'])
-def test_a_damaged_run_is_told_with_a_mend_that_there_is(contents: str, tmp_path: Path) -> None:
+def test_a_damaged_run_is_reported_with_a_mend_that_there_is(contents: str, tmp_path: Path) -> None:
     """`train --overwrite` would mend it; a sweep and a figure have no such option."""
     cell = make_cell("a")
     (tmp_path / cell.name).mkdir()
@@ -286,7 +286,7 @@ def answer(monkeypatch: pytest.MonkeyPatch, order: object, status: int = 0) -> N
     monkeypatch.setattr("jaxrl_vis.host.devices.subprocess.run", lambda *_, **__: done)
 
 
-def test_devices_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_devices_are_distinguished(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     answer(monkeypatch, [["gpu", "H200"]] * 2)
     assert [device.environment for device in list_devices()] == [{"CUDA_VISIBLE_DEVICES": "0"}, {"CUDA_VISIBLE_DEVICES": "1"}]

@@ -62,7 +62,7 @@ def test_a_finished_sweep_trains_nothing_and_shows_what_was_reached(tmp_path: Pa
         (["Reacher", "--executor", "slurm"], "--executor slurm cannot be used"),
     ],
 )
-def test_mistakes_are_told_in_one_line(
+def test_mistakes_are_reported_in_one_line(
     words: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))  # where there is no Slurm
@@ -78,7 +78,7 @@ def run_jobs(cells: Sequence[Cell], runs: Path, command: Script, seconds: float 
     return run_cells(cells, runs, lambda: devices, seconds, command, said.append, start), said
 
 
-def test_jobs_train_cells_each_on_its_device_and_failures_are_told(tmp_path: Path) -> None:
+def test_jobs_train_cells_each_on_its_device_and_failures_are_reported(tmp_path: Path) -> None:
     cells = [make_cell(name) for name in "abc"]
     failures, said = run_jobs(cells, tmp_path, Script(b="fails"))
     (line,) = failures

@@ -39,7 +39,7 @@ def test_replays_give_what_was_put_in(mean_age):
     _, empty, insert, sample, gather, is_stored = replay_programs(mean_age)
 
     @given(st.integers(0, 1000), st.integers(1, 5), seeds, st.data())
-    def law(begin, count, seed, data):
+    def check_property(begin, count, seed, data):
         state, kept = empty, {}
         for number in range(count):
             iteration = begin + number
@@ -61,7 +61,7 @@ def test_replays_give_what_was_put_in(mean_age):
         np.testing.assert_array_equal(batch.observation_t[:, :, 0, 0], np.stack([ids, time], axis=-1))
         np.testing.assert_array_equal(batch.goal[:, :, 3, 3], np.stack([ids, slots], axis=-1))
 
-    law()
+    check_property()
 
 
 # --- relabelling ---
@@ -117,7 +117,7 @@ def test_weights_are_finite_not_negative_and_nobodys_by_name(name):
         st.lists(st.tuples(*[dots] * 3), min_size=3, max_size=3),
         st.permutations(range(3)),
     )
-    def law(values, products, order):
+    def check_property(values, products, order):
         def named(order):
             of_losses = [{MAIN: one[0], **{OTHERS[i]: one[1 + order[i]] for i in range(3)}} for one in values]
             return jax.tree.map(np.float32, (of_losses, [{OTHERS[i]: one[order[i]] for i in range(3)} for one in products]))
@@ -131,7 +131,7 @@ def test_weights_are_finite_not_negative_and_nobodys_by_name(name):
         for place in range(3):
             assert float(exchanged[OTHERS[place]]) == float(weights[OTHERS[order[place]]])
 
-    law()
+    check_property()
 
 
 # --- quaternions ---
