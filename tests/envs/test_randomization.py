@@ -30,14 +30,14 @@ def keys(first: int = 0) -> jax.Array:
     return jax.random.split(jax.random.key(first), COUNT)
 
 
-def make(ranges: Randomization, **options: Any) -> PointMass:
-    return PointMass(PointMassConfig(image_size=SIZE, randomization=ranges, **options))
+def make(ranges: Randomization, task: type[PointMass] = PointMass, **options: Any) -> PointMass:
+    return task(PointMassConfig(image_size=SIZE, randomization=ranges, **options))
 
 
 @functools.cache
 def episodes(ranges: Randomization = OFF) -> tuple[Any, Any]:
-    """Return the starts of COUNT episodes, and their states after STEPS full actions."""
-    env = make(ranges)
+    """Starts of COUNT episodes, and their state after STEPS full actions."""
+    env = make(ranges, point_mass.SimulatedPointMass)
 
     def play(keys: jax.Array) -> tuple[Any, Any]:
         start = jax.vmap(env.reset)(keys)

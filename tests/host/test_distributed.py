@@ -143,7 +143,7 @@ def two_trainings(*words: str) -> list[tuple[int, str, str]]:
 
 def test_processes_train_a_task_with_physics(tmp_path: Path) -> None:
     """Its model must lie on devices of each process itself."""
-    task = ["point_mass:CarriedPointMass", "--env-folder", str(Path(__file__).parents[1])]
+    task = ["point_mass:StatePointMass", "--env-folder", str(Path(__file__).parents[1])]
     ends = two_trainings(*task, "--seeds", "2", "--run-dir", str(tmp_path / "run"))
     assert [status for status, _, _ in ends] == [0, 0], ends
     assert {row["seed"] for row in rows_without_time(tmp_path / "run")} == {0, 1}
