@@ -33,7 +33,7 @@ def equal_runs_are_drawn_once() -> Iterator[None]:
         return bool(rows)
 
     def write_video_once(episodes: videos.EpisodeImages, path: Path, *options: Any, **named: Any) -> None:
-        shown = [(part.shape, hashlib.sha256(part).digest()) for part in vars(episodes).values()]
+        shown = [(part.shape, part.dtype.str, hashlib.sha256(part.tobytes()).digest()) for part in vars(episodes).values()]
         _drawn((repr((shown, options, named)), path.suffix), path, lambda: write_video(episodes, path, *options, **named))
 
     with pytest.MonkeyPatch.context() as monkeypatch:
