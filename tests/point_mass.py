@@ -1,4 +1,7 @@
-"""Environment that compiles quickly, written as a user would write one: a ball on two sliders, each with a motor."""
+"""Environment that compiles quickly, written as a user would write one: a ball on two sliders.
+
+Actions are velocities; in `SimulatedPointMass` they are forces of motors, for tests of what a physics step does.
+"""
 
 import contextlib
 import dataclasses
@@ -48,7 +51,7 @@ class PointMassConfig(PixelsConfig):
 
 
 class PointMass(MjxGoalEnv):
-    """Point mass whose actions are velocities: without a physics step it is traced and compiled in half the time."""
+    """Point mass whose actions are velocities: without a physics step, tracing and compiling take half the time."""
 
     action_size, camera, control_period = 2, "above", 0.05
 

@@ -290,7 +290,7 @@ def test_a_learner_trains_in_environments_that_vary() -> None:
     """Every episode starts at the same place with a different appearance; learning continues, reproducibly bit for bit."""
     settings = {"num_envs": 4, "replay_transitions": 40, "updates_per_iteration": 2, "batch_size": 16, "eval_episodes": 2}
     # Other tests see that colours vary; depth takes half as long to compile, and varies with the camera.
-    program = make_train_step(make(ALL, pixels="depth"), preset("debug", **settings))
+    program = make_train_step(make(ALL, point_mass.SimulatedPointMass, pixels="depth"), preset("debug", **settings))
 
     def train() -> tuple[Any, list[Any]]:
         loop, rows = program.init(keys()[:1]), []

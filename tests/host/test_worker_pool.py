@@ -24,7 +24,7 @@ from jaxrl_vis.run import signals
 
 @pytest.fixture(autouse=True, scope="module")
 def devices_are_listed_once() -> Iterator[None]:
-    """Devices are listed in a process of its own, at the start of each pool."""
+    """List the devices once: each pool would start a process that does."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(devices, "list_devices", functools.cache(devices.list_devices))
         yield
