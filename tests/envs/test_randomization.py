@@ -36,7 +36,7 @@ def make(ranges: Randomization, task: type[PointMass] = PointMass, **options: An
 
 @functools.cache
 def episodes(ranges: Randomization = OFF) -> tuple[Any, Any]:
-    """Starts of COUNT episodes, and their state after STEPS full actions."""
+    """Return the starts of COUNT episodes, and their states after STEPS full actions."""
     env = make(ranges, point_mass.SimulatedPointMass)
 
     def play(keys: jax.Array) -> tuple[Any, Any]:

@@ -142,7 +142,7 @@ def two_trainings(*words: str) -> list[tuple[int, str, str]]:
 
 
 def test_processes_train_a_task_with_physics(tmp_path: Path) -> None:
-    """Its model must lie on devices of each process itself."""
+    """Each process must place the task's model on its own devices."""
     task = ["point_mass:StatePointMass", "--env-folder", str(Path(__file__).parents[1])]
     ends = two_trainings(*task, "--seeds", "2", "--run-dir", str(tmp_path / "run"))
     assert [status for status, _, _ in ends] == [0, 0], ends
