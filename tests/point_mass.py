@@ -1,4 +1,7 @@
-"""Environment that compiles quickly, written as a user would write one: a ball on two sliders, each with a motor."""
+"""Environment that compiles quickly, written as a user would write one: a ball on two sliders.
+
+Actions are velocities; in `SimulatedPointMass` they are forces of motors, for tests of what a physics step does.
+"""
 
 import contextlib
 import dataclasses
@@ -48,6 +51,8 @@ class PointMassConfig(PixelsConfig):
 
 
 class PointMass(MjxGoalEnv):
+    """Point mass whose actions are velocities: without a physics step, tracing and compiling take half the time."""
+
     action_size, camera, control_period = 2, "above", 0.05
 
     def __init__(self, config: PointMassConfig):
@@ -64,7 +69,9 @@ class PointMass(MjxGoalEnv):
         return self.configuration(jax.random.uniform(key, (2,), minval=-0.3, maxval=0.3))
 
     def act(self, data: Any, action: jax.Array) -> Any:
-        return mjx_model.simulate(self._model, data.replace(ctrl=action), 1)
+        velocity = 0.5 * action
+        data = data.replace(qpos=data.qpos + self.control_period * velocity, qvel=velocity)
+        return mjx_model.mjx.kinematics(self._model, data)
 
     def achieved(self, data: Any) -> jax.Array:
         return data.qpos
@@ -86,17 +93,29 @@ class StatePointMass(PointMass):
         return jnp.concatenate([data.qpos, data.qvel])
 
 
+class SimulatedPointMass(PointMass):
+    """Point mass whose actions are the forces of its motors, in a physics step."""
+
+    def act(self, data: Any, action: jax.Array) -> Any:
+        return mjx_model.simulate(self._model, data.replace(ctrl=action), 1)
+
+
+class SimulatedStatePointMass(SimulatedPointMass, StatePointMass):
+    """State point mass with physics."""
+
+
 @contextlib.contextmanager
-def registered(programs_folder: Path | None = None) -> Iterator[None]:
+def registered(programs_folder: Path | None = None, task: type[PointMass] = PointMass) -> Iterator[None]:
     """Register the environment as VisualPoint within the context.
 
     Args:
         programs_folder: Folder in which traced programs are cached, as those of built-in environments are; None for no cache.
+        task: Class of the environment.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(registry._ENTRIES, "VisualPoint", registry._Entry(PointMass, PointMassConfig))
+        patch.setitem(registry._ENTRIES, "VisualPoint", registry._Entry(task, PointMassConfig))
         if programs_folder is not None:
-            patch.setattr(PointMass, "__module__", "jaxrl_vis_envs.tasks.point_mass")
+            patch.setattr(task, "__module__", "jaxrl_vis_envs.tasks.point_mass")
             patch.setenv(trace_cache.CACHE_VARIABLE, "1")
             patch.setattr(programs, "enable_compilation_cache", lambda: str(programs_folder))
         yield

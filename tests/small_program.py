@@ -20,7 +20,8 @@ def _trained_alike(config: Config) -> Config:
 
 
 @functools.cache
-def _program_of(config: Config) -> train_step.TrainStep:
+def _program_of(config: Config, task: type[GoalEnv]) -> train_step.TrainStep:
+    """Create the program of a configuration; ``task`` tells apart what tests register under one name."""
     program = train_step.make_train_step(make_env(config), config)
     original = program.learn.__wrapped__
 
@@ -35,7 +36,7 @@ def make_train_step(env: GoalEnv, config: Config, policy_alone: bool = False) ->
     """Replacement for `train_step.make_train_step` that reuses the functions of an earlier equal configuration."""
     if policy_alone:
         return train_step.make_train_step(env, config, policy_alone=True)
-    return dataclasses.replace(_program_of(_trained_alike(config)), config=config)
+    return dataclasses.replace(_program_of(_trained_alike(config), type(env)), config=config)
 
 
 def traces(config: Config) -> int:

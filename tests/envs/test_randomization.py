@@ -30,14 +30,14 @@ def keys(first: int = 0) -> jax.Array:
     return jax.random.split(jax.random.key(first), COUNT)
 
 
-def make(ranges: Randomization, **options: Any) -> PointMass:
-    return PointMass(PointMassConfig(image_size=SIZE, randomization=ranges, **options))
+def make(ranges: Randomization, task: type[PointMass] = PointMass, **options: Any) -> PointMass:
+    return task(PointMassConfig(image_size=SIZE, randomization=ranges, **options))
 
 
 @functools.cache
 def episodes(ranges: Randomization = OFF) -> tuple[Any, Any]:
     """Return the starts of COUNT episodes, and their states after STEPS full actions."""
-    env = make(ranges)
+    env = make(ranges, point_mass.SimulatedPointMass)
 
     def play(keys: jax.Array) -> tuple[Any, Any]:
         start = jax.vmap(env.reset)(keys)
@@ -290,7 +290,7 @@ def test_a_learner_trains_in_environments_that_vary() -> None:
     """Every episode starts at the same place with a different appearance; learning continues, reproducibly bit for bit."""
     settings = {"num_envs": 4, "replay_transitions": 40, "updates_per_iteration": 2, "batch_size": 16, "eval_episodes": 2}
     # Other tests see that colours vary; depth takes half as long to compile, and varies with the camera.
-    program = make_train_step(make(ALL, pixels="depth"), preset("debug", **settings))
+    program = make_train_step(make(ALL, point_mass.SimulatedPointMass, pixels="depth"), preset("debug", **settings))
 
     def train() -> tuple[Any, list[Any]]:
         loop, rows = program.init(keys()[:1]), []

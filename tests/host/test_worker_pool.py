@@ -10,15 +10,24 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 from jaxrl_vis.errors import RequestError, Terminated, WorkerError
+from jaxrl_vis.host import devices
 from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all, map_unordered
 from jaxrl_vis.run import signals
+
+
+@pytest.fixture(autouse=True, scope="module")
+def devices_are_listed_once() -> Iterator[None]:
+    """List the devices once: each pool would start a process that does."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(devices, "list_devices", functools.cache(devices.list_devices))
+        yield
 
 
 def squared(offset: int, number: int) -> Record:

@@ -211,7 +211,7 @@ LEARNING = {
 
 
 def test_it_learns_the_point_mass_with_several_seeds():
-    env = point_mass.StatePointMass(point_mass.PointMassConfig(horizon=10))
+    env = point_mass.SimulatedStatePointMass(point_mass.PointMassConfig(horizon=10))
     program = make_train_step(env, preset("debug", **LEARNING, seeds=2))
     loop = begin(program, jax.random.split(jax.random.key(7), 2))
     for _ in range(8):

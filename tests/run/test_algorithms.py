@@ -5,11 +5,13 @@ from pathlib import Path
 import numpy as np
 import probe_environments as probes
 import pytest
+import small_program
 from fake_program import rows_without_time
 
 import jaxrl_vis
 from jaxrl_vis import cli
 from jaxrl_vis.learner.train_step import ALGORITHMS
+from jaxrl_vis.run import trainer
 from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.pixels import PixelsConfig
 
@@ -21,6 +23,7 @@ TRAIN += ["--full-checkpoint-interval", "2", "--checkpoint-interval", "2", "--se
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     task = registry._Entry(lambda _: probes.SeenGoWhereTold(), PixelsConfig)
     monkeypatch.setitem(registry._ENTRIES, "VisualTold", task)
+    monkeypatch.setattr(trainer, "make_train_step", small_program.make_train_step)  # the three runs share their programs
 
 
 @pytest.mark.parametrize("algorithm", [name for name in ALGORITHMS if name != "ddpg"])

@@ -49,7 +49,7 @@ def folder(tmp_path, monkeypatch) -> Iterator[Path]:
     """Folder in which programs of the registered tasks are kept."""
     monkeypatch.setattr(compilation, "_assumed", set())  # of kernels that other tests have let in
     monkeypatch.setitem(registry._ENTRIES, "VisualTold", registry._Entry(lambda _: Told(), PixelsConfig))
-    with point_mass.registered(tmp_path):
+    with point_mass.registered(tmp_path, point_mass.SimulatedPointMass):
         yield tmp_path / "programs"
 
 
