@@ -80,8 +80,8 @@ class Batch(Replaceable):
         shift: [B, 2] int32, pixels by which to shift the images down and to the right; None for no shift.
         views: [B, ...] images in the observation's dtype, computed by auxiliary tasks, by task (`AuxTask.view`).
         targets: Targets of auxiliary tasks, by task.
-        reached: [B, ...] the observation after the action in the form of a goal, if the forms differ (stacked images); else
-            None.
+        achieved_goal: [B, ...] the observation after the action in the form of a goal, if the forms differ (stacked images);
+            else None.
         success: [B] float32, 1 where the true state after the action reaches the goal, else 0; for diagnostics only. None if
             rewards span several steps.
         full_states: [2, B, P - G] float32, `Episodes.full_states` before and after the action; None if not collected.
@@ -96,7 +96,7 @@ class Batch(Replaceable):
     shift: jax.Array | None = None
     views: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
     targets: dict[str, Any] = dataclasses.field(default_factory=dict)
-    reached: jax.Array | None = None
+    achieved_goal: jax.Array | None = None
     success: jax.Array | None = None
     full_states: jax.Array | None = None
 

@@ -1,4 +1,4 @@
-"""Calls of the readers of files from outside in a separate process, whose crashes (in libraries written in C) are reported.
+"""Run the readers of untrusted files in a separate process, so that crashes in C libraries are reported.
 
     worker = Worker()
     outcome = worker.read("calibration", {"rig.yaml": b"..."})

@@ -63,7 +63,7 @@ class Claim:
 
     Attributes:
         claim: Statement of the thesis.
-        answer: One of `HOLDS`, `PARTLY` and `FAILS`.
+        outcome: One of `HOLDS`, `PARTLY` and `FAILS`.
         finding: Verdicts and numbers from the records.
         interval: Intervals and p-values.
         source: Link to figure and table.
@@ -72,7 +72,7 @@ class Claim:
     """
 
     claim: str
-    answer: str
+    outcome: str
     finding: str
     interval: str
     source: str
@@ -96,7 +96,7 @@ def _rewards(first: str, second: str, tasks: Sequence[str]) -> list[Comparison]:
     return [Comparison(SHORT[task], indicator.run(task, first), indicator.run(task, second)) for task in tasks]
 
 
-def _answer(comparisons: Sequence[Comparison], expected: Sequence[str] = ("better",)) -> str:
+def _outcome(comparisons: Sequence[Comparison], expected: Sequence[str] = ("better",)) -> str:
     right = [comparison.verdict in expected for comparison in comparisons]
     return HOLDS if all(right) else PARTLY if any(right) else FAILS
 
@@ -115,7 +115,7 @@ def _comparison_claim(
     finding = _findings(comparisons) + (f". {note}" if note else "")
     return Claim(
         claim,
-        _answer(comparisons, expected),
+        _outcome(comparisons, expected),
         finding,
         "; ".join(comparison.text for comparison in comparisons),
         source,
@@ -178,7 +178,7 @@ def _speed_ups() -> Claim:
         comparisons.append(Comparison(f"{label} at 0.95, to {c.format_steps(budget)}", *pair, budget))
     return Claim(
         "OL-AUX-5 needs 2 times fewer steps on Fetch, about 3 times fewer on hand and finger",
-        _answer(comparisons),
+        _outcome(comparisons),
         f"{finding}, with target networks that keep 0.98 (the release's script) and 0.95 (OpenAI Baselines' default)",
         "; ".join(comparison.text for comparison in comparisons),
         "[Speed of the target networks](lab/target_decay.md)",
@@ -329,7 +329,7 @@ def _finger() -> Claim:
     records = [record for comparison in named for record in (comparison.first, comparison.second)]
     return Claim(
         "Indicator rewards work from images alone (the thesis did not try the finger)",
-        _answer(named[:1], ("better", "level")),
+        _outcome(named[:1], ("better", "level")),
         f"{_findings(named)}. {note}",
         "; ".join(comparison.text for comparison in named),
         f"[the finger]({_INDICATOR}#the-finger)",
@@ -379,7 +379,7 @@ def _seeds(claim: Claim) -> str:
 def _table() -> str:
     lines = ["| claim of the thesis | outcome | finding | interval | seeds | figure |", "|---|---|---|---|---|---|"]
     lines += [
-        f"| {row.claim} | {row.answer} | {row.finding} | {row.interval} | {_seeds(row)} | {row.source} |" for row in claims()
+        f"| {row.claim} | {row.outcome} | {row.finding} | {row.interval} | {_seeds(row)} | {row.source} |" for row in claims()
     ]
     made = origin_sentence([record for row in claims() for record in row.records])
     return "\n".join([*lines, "", made])
@@ -387,7 +387,7 @@ def _table() -> str:
 
 def _short() -> str:
     lines = ["| claim of the thesis | outcome | finding |", "|---|---|---|"]
-    lines += [f"| {row.claim} | {row.answer} | {row.finding} |" for row in claims() if row.in_readme]
+    lines += [f"| {row.claim} | {row.outcome} | {row.finding} |" for row in claims() if row.in_readme]
     return "\n".join([*lines, "", "Intervals, p-values, seeds and figures: [Claims of the thesis](docs/claims.md)."])
 
 

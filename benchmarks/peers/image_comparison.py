@@ -16,7 +16,7 @@ from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis_envs.render import Scene, render_planes
 
 CPU_SCENES = ("finger", "fetch_reach")
-COMPARED = 32
+NUM_COMPARED = 32
 """Number of compared images per batch."""
 
 # Renderings of the same scene differ by rounding and on silhouettes. On a CPU, in all scenes and
@@ -28,7 +28,7 @@ MAX_DIFFERENCE = 1.5  # grey levels of 255, the mean over pixels and channels
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """Input of a peer, and our images for comparison. K is at most `COMPARED`.
+    """Input of a peer, and our images for comparison. K is at most `NUM_COMPARED`.
 
     Attributes:
         config: Entries of the record.
@@ -125,7 +125,7 @@ def compare(case: images.Case, repeats: int, rate: float) -> Comparison:
         planes = render_planes(scene, poses, segmentation=True, quantized=True)
         return planes.rgb, planes.depth, planes.segmentation
 
-    compared = {name: jnp.asarray(rows[: COMPARED // case.cameras]) for name, rows in case.batches[0].items()}
+    compared = {name: jnp.asarray(rows[: NUM_COMPARED // case.cameras]) for name, rows in case.batches[0].items()}
     drawn = jaxrl_vis_envs.jit(lambda scene, poses: images.draw_all(case, scene, poses, draw))(scene, compared)
     colours, depth, segmentation = map(np.asarray, drawn)
     textured = np.append(textured_geoms(mj_model), scene.sky == "texture")  # index -1, the last, is the sky

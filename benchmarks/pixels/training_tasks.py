@@ -54,7 +54,7 @@ class Task:
 
 
 _FRAMES = 3
-_CARTPOLE_STEP = 0.04
+_CARTPOLE_CONTROL_PERIOD = 0.04
 """Control period, s: over three images 0.01 s apart, a falling pole moves by less than a pixel."""
 _COMMON: dict[str, Any] = {
     "num_eval_envs": 128,
@@ -91,7 +91,7 @@ class _UntilFallen:
 
 
 def _make_cartpole(terminates: bool) -> pixels.PixelEnv:
-    env = playground.load("CartpoleBalance", ctrl_dt=_CARTPOLE_STEP)
+    env = playground.load("CartpoleBalance", ctrl_dt=_CARTPOLE_CONTROL_PERIOD)
     return pixels.wrap(_UntilFallen(env) if terminates else env, "fixed", IMAGE_SIZE, frames=_FRAMES, layout="images")
 
 
@@ -154,7 +154,7 @@ TASKS = {
         lambda metrics: round(float(metrics["eval/episode_reward"]), 1),
         "of 1,000",
         900.0,
-        {"frames": _FRAMES, "step_s": _CARTPOLE_STEP},
+        {"frames": _FRAMES, "step_s": _CARTPOLE_CONTROL_PERIOD},
         functools.partial(_make_cartpole, terminates=False),
     ),
     "FetchReach": Task(

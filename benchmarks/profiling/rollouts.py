@@ -19,7 +19,7 @@ import jaxrl_vis_envs
 from benchmarks.profiling.kernels import kernels
 from jaxrl_vis_envs.compiling.compilation import compiler_options
 
-STEPS, COMPARED, SHOWN = 10, 64, 6
+STEPS, NUM_COMPARED, NUM_SHOWN = 10, 64, 6
 
 
 def rollout(env: Any, count: int, steps: int) -> Any:
@@ -65,7 +65,7 @@ def report_speed(name: str, env: Any, count: int) -> None:
         f"compiled in {compile_s:.0f} s",
         flush=True,
     )
-    for kernel, nanoseconds in spent.most_common(SHOWN):
+    for kernel, nanoseconds in spent.most_common(NUM_SHOWN):
         print(f"    {nanoseconds / substeps / 1e3:8.1f} us  {kernel[:90]}")
 
 
@@ -76,8 +76,8 @@ def report_deviation(name: str, env: Any) -> None:
         name: Label of the line.
         env: The environment.
     """
-    data = jaxrl_vis_envs.jit(rollout(env, COMPARED, 5))(reset(env, COMPARED), jax.random.key(3)).data
-    actions = jax.random.uniform(jax.random.key(4), (COMPARED, env.action_size), minval=-1.0, maxval=1.0)
+    data = jaxrl_vis_envs.jit(rollout(env, NUM_COMPARED, 5))(reset(env, NUM_COMPARED), jax.random.key(3)).data
+    actions = jax.random.uniform(jax.random.key(4), (NUM_COMPARED, env.action_size), minval=-1.0, maxval=1.0)
     here = jaxrl_vis_envs.jit(jax.vmap(env.act))(data, actions)
     moved = jax.device_put((data, actions), jax.devices("cpu")[0])
     there = jax.jit(jax.vmap(env.act), compiler_options=compiler_options("cpu"))(*moved)

@@ -193,21 +193,21 @@ def control_logits(fitted: list[ImageStatistics], tested: list[ImageStatistics])
     return weights[0] + inputs(tested) @ weights[1:]
 
 
-def report(name: str, images: list[ImageStatistics], gate: Gate, doubts_of_control: np.ndarray) -> None:
+def report(name: str, images: list[ImageStatistics], gate: Gate, control_doubts: np.ndarray) -> None:
     """Print a line: number of misread images, area under the ROC curve of gate and control, and shares flagged by the gate.
 
     Args:
         name: Label of the line.
         images: Statistics of N images.
         gate: The gate.
-        doubts_of_control: [N] logits of `control_logits`.
+        control_doubts: [N] logits of `control_logits`.
     """
     wrong = np.array([image.f1 < MIN_F1 for image in images])
     doubts = np.array([gate.doubt(image.pooled, image.scores) for image in images])
     flagged = doubts > gate.threshold
     parts = [f"{wrong.sum()} of {len(images)} read wrongly"]
     if wrong.any() and not wrong.all():
-        roc = area_under_roc(doubts, wrong), area_under_roc(doubts_of_control, wrong)
+        roc = area_under_roc(doubts, wrong), area_under_roc(control_doubts, wrong)
         parts.append(f"area under ROC {roc[0]:.3f}, control {roc[1]:.3f}")
     if wrong.any():
         parts.append(f"{flagged[wrong].mean():.0%} of these flagged")

@@ -22,13 +22,13 @@ class Audit(TaskImages):
     """
 
     rewards: tuple[str, ...] = ("indicator", "indicator_tolerance")
-    """indicator, indicator_tolerance, features, run folders, or module:function."""
+    """Rewards to audit: indicator, indicator_tolerance, features, run folders, or module:function."""
     episodes: int = 64
     """Number of episodes of random actions."""
     goals: int = 32
     """Number of goals that a random search tries to reach using only the reward."""
     sequences: int = 64
-    """Number of action sequences that it tries per goal."""
+    """Number of action sequences that the random search tries per goal."""
     noise: float = 0.0
     """Standard deviation of the camera noise on images and goals, grey levels; the search has none."""
     tolerance: float = 8.0

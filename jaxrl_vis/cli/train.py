@@ -67,7 +67,7 @@ class Train:
     coordinator: str | None = None
     """Address of the first of several processes that train together, as HOST:PORT; not needed under srun and mpirun."""
     num_processes: int | None = None
-    """Number of these processes."""
+    """Number of processes that train together, with --coordinator."""
     process_id: int | None = None
     """Index of this process, from 0; the first one writes metrics and images."""
     start_timeout: int = distributed.START_S

@@ -72,14 +72,14 @@ def child_environment() -> dict[str, str]:
 
 
 def install_command(extra: str) -> str:
-    """Return the command that installs one of this project's extras: in a clone or an installed copy, with or without pip."""
+    """Return the shell command that installs an extra of this project, for a clone or an installed copy, by pip or uv."""
     in_clone = (CHECKOUT / "pyproject.toml").exists()
     local_uv = CHECKOUT / ".uv" / "bin" / "uv"
     if importlib.util.find_spec("pip"):
         installer = "pip"
     else:  # as in an environment that uv made
-        installer = ".uv/bin/uv pip" if local_uv.exists() and shutil.which("uv") is None else "uv pip"
-    return f"{installer} install '.[{extra}]' in {CHECKOUT}" if in_clone else f"{installer} install 'jaxrl-vis[{extra}]'"
+        installer = f"{local_uv} pip" if local_uv.exists() and shutil.which("uv") is None else "uv pip"
+    return f"{installer} install '{CHECKOUT if in_clone else 'jaxrl-vis'}[{extra}]'"
 
 
 def versions() -> dict[str, str]:

@@ -102,7 +102,9 @@ def worker_pool(workers: int) -> Iterator[UnorderedMap]:
     others = set(multiprocessing.active_children())
     with shielded_children():  # starts multiprocessing's helper process
         counter = spawning.Value("i", 0)
-    pool = ProcessPoolExecutor(workers, mp_context=spawning, initializer=_prepare, initargs=(counter, _environments(workers)))
+    pool = ProcessPoolExecutor(
+        workers, mp_context=spawning, initializer=_prepare, initargs=(counter, _worker_env_vars(workers))
+    )
 
     def submit(function: Callable[[A], T], argument: A) -> Future[T]:
         with shielded_children():  # may start a process, which only this one may end: see `_prepare`
@@ -138,7 +140,7 @@ def share_accelerator() -> None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
-def _environments(workers: int) -> list[dict[str, str]]:
+def _worker_env_vars(workers: int) -> list[dict[str, str]]:
     """Return the environment variables of the workers: their GPU, if there are several, and their number of threads."""
     import jax
 
@@ -161,14 +163,14 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _prepare(counter: Any, environments: list[dict[str, str]]) -> None:
+def _prepare(counter: Any, env_vars: list[dict[str, str]]) -> None:
     """Initialise a worker process."""
     obey_parent_only()  # a signal to the process group would otherwise interrupt parent and worker at once
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with counter.get_lock():
         index = counter.value
         counter.value += 1
-    variables = environments[index % len(environments)]
+    variables = env_vars[index % len(env_vars)]
     os.environ.update(variables)
     try:
         import cv2

@@ -471,7 +471,9 @@ class RunLoop:
         self._saver.finish()
         self._console.stop()
         if interruption.reached_any():
-            self._echo(f"{interruption.name}: all is trained and saved; to draw the curve and the video, {self._saver.resume}")
+            self._echo(
+                f"{interruption.name}: all is trained and saved; to draw the curve and the video, {self._saver.resume_hint}"
+            )
             interruption.end()
         if self._programs.shows_images and not self._recorded:
             # Killed after the last evaluation, before this: resumed with nothing left to evaluate.

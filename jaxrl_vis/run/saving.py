@@ -156,11 +156,11 @@ class Saver:
                 self.save_full(loop, iteration, progress)
             except StorageError as error:
                 missing = "there is no full checkpoint" if self.has(RECENT, iteration) else "the replay is not"
-                self._echo(f"the networks are saved, {missing}: {error}; {self.resume}")
+                self._echo(f"the networks are saved, {missing}: {error}; {self.resume_hint}")
                 return
         if distributed.is_first():
             self._checkpoints.recent.clear()
-        self._echo(f"saved; {self.resume}")
+        self._echo(f"saved; {self.resume_hint}")
 
     def rescue(self, loop: LoopState | None, iteration: int, progress: Progress) -> None:
         """Try to save the learner after an unexpected error; failures are not reported."""
@@ -178,7 +178,7 @@ class Saver:
             self._checkpoints.wait()
 
     @property
-    def resume(self) -> str:
+    def resume_hint(self) -> str:
         """Hint for messages: the command-line options that resume the run, quoted for a shell."""
         return f"go on with --run-dir {shlex.quote(str(self._folder.path))} --resume"
 
@@ -198,7 +198,7 @@ class Saver:
         cause = error.__cause__
         is_full = "no space left" in str(error).lower() or getattr(cause, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
         hint = "make room" if is_full else "fix that"
-        return StorageError(f"{error}; {good}: {hint}, then {self.resume}")
+        return StorageError(f"{error}; {good}: {hint}, then {self.resume_hint}")
 
     def _refuse_nonfinite(self, loop: LoopState, iteration: int) -> None:
         # The guard checks losses and states; a parameter that breaks in the very last update appears in those of the next

@@ -112,7 +112,7 @@ def test_stacked_images_are_compared_as_goals():
         train = train.replace(normalizer=normalizer.update(train.normalizer, batch.observations))
         scaling = networks.batch_scaling(train.statistics)
         inputs = networks.prepare_batch(scaling, batch)
-        both = batch.replace(reached=reached), batch
+        both = batch.replace(achieved_goal=reached), batch
         return [
             learned_reward.compute_batch_rewards(train.agent.reward_model, scaling.observations, inputs, each).reward
             for each in both

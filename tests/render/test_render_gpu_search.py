@@ -22,7 +22,7 @@ from jaxrl_vis_envs.render.outputs import Outputs, Planes
 from jaxrl_vis_envs.render.pixel.lights import Light
 from jaxrl_vis_envs.render.pixel.prepare import prepare
 
-KERNEL = functools.partial(search.by_kernel, interpret=True)
+KERNEL = functools.partial(search.traverse_on_gpu, interpret=True)
 SEARCH = images._Search(
     search.layout, functools.partial(search.nearest, interpret=True), functools.partial(search.blocked, walk=KERNEL)
 )

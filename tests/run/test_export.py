@@ -115,7 +115,9 @@ def test_a_camera_task_describes_its_image(monkeypatch: pytest.MonkeyPatch, runs
 
 
 def made(name: str, **changes: Any) -> tuple[Any, ...]:
-    """Return a policy of the networks of a preset, with random parameters and statistics, and a batch of inputs."""
+    """Return the weights of a preset's policy with random values, the shape and dtype of its observations, a batch of
+    observations and goals, and the actions expected for them.
+    """
     config = preset(name, compute_dtype="float32", **changes)
     channels = {"rgbd": 4, "rgb": 3, "depth": 1}[config.environment.pixels]
     size = config.environment.image_size

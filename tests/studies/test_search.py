@@ -41,7 +41,7 @@ NOISE = read_range("action-noise=0.1,0.2")
 
 
 class Script:
-    """Commands of trials, with special behaviour of some families; it records its calls."""
+    """Function that returns the command of a trial, with a given behaviour for some families, and records its calls."""
 
     def __init__(self, **behaviour: str):
         self.behaviour, self.calls = behaviour, []

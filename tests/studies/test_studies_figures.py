@@ -26,10 +26,10 @@ from jaxrl_vis.studies.figures.tables import LabelledLine, steps_table, weights_
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, LEVELS, STUDIES, VARIANTS
 from jaxrl_vis_envs import registry
 
-EVERY = 20_000
+STEPS_PER_EVALUATION = 20_000
 
 
-def write_run(cell: Cell, runs: Path, success: Callable[[int], float], every: int = EVERY, **extra) -> None:
+def write_run(cell: Cell, runs: Path, success: Callable[[int], float], every: int = STEPS_PER_EVALUATION, **extra) -> None:
     """Write a finished run whose seeds differ by a hundredth."""
     folder = runs / cell.name
     folder.mkdir(parents=True)
@@ -140,7 +140,7 @@ def test_differences_of_curves_are_taken_where_both_are_known() -> None:
 def line(values: list[list[float]], task: str = FETCH, variant: str = "ol_aux_5") -> Line:
     """Return a line with evaluations every 20 k steps; ``values`` are [S][P]."""
     rows = [
-        {"seed": seed, "env_steps": EVERY * place, "updates": 200 * place, "eval/success": value}
+        {"seed": seed, "env_steps": STEPS_PER_EVALUATION * place, "updates": 200 * place, "eval/success": value}
         for seed, row in enumerate(values)
         for place, value in enumerate(row, 1)
     ]
@@ -220,7 +220,7 @@ def test_a_figure_shows_what_is_finished_and_lists_the_rest(tmp_path: Path, caps
     assert "preset paper, one gradient step per 100 environment steps; seeds 0 to 4" in text
     assert "| OL-AUX-5 | 80 k (80 k to 80 k) | 1.8 |" in text and "### VisualHandReach" in text
     assert "VisualFingerTurn" not in text.partition("Not finished")[0]
-    ours = [(steps, min(1.0, slope(1.0)(steps))) for steps in range(EVERY, 260_001, EVERY)]
+    ours = [(steps, min(1.0, slope(1.0)(steps))) for steps in range(STEPS_PER_EVALUATION, 260_001, STEPS_PER_EVALUATION)]
     difference = mean_difference(ours, released_curves()[FETCH, "none"])
     assert difference is not None and f"mean absolute difference to the authors' curve {difference:.3f}" in text
     assert "Revision: " + "a" * 40 in text and "Device: made up." in text

@@ -82,14 +82,14 @@ def _table(folder: Path) -> str | None:
     shown = steps[::-1][::every][::-1]
     by_step = {step: [[row[name] for row in rows if row["env_steps"] == step] for name in _COLUMNS] for step in steps}
     lowest = {step: min(by_step[step][-1]) for step in steps}
-    reached = next((step for step in steps if all(lowest[later] >= 0.95 for later in steps if later >= step)), None)
+    steps_to_target = next((step for step in steps if all(lowest[later] >= 0.95 for later in steps if later >= step)), None)
     return "\n".join(
         [
             "| environment steps | gradient steps | box moves, with exploration | success with exploration | success |",
             "|---|---|---|---|---|",
             *(_row(by_step[step]) for step in shown),
             "",
-            _caption(folder, seeds, rows[-1], reached),
+            _caption(folder, seeds, rows[-1], steps_to_target),
         ]
     )
 
@@ -103,11 +103,11 @@ def _row(columns: Sequence[Sequence[float]]) -> str:
     return "| " + " | ".join(cells) + f"{spread} |"
 
 
-def _caption(folder: Path, seeds: Sequence[int], last: dict, reached: int | None) -> str:
-    """Return a caption with seeds, revision, device and duration of a run, and ``reached``, the steps to a lasting 0.95."""
+def _caption(folder: Path, seeds: Sequence[int], last: dict, steps_to_target: int | None) -> str:
+    """Return a caption with seeds, revision, device and duration of a run, and the steps to a lasting 0.95."""
     record = read_record(folder)
     count = f"{len(seeds)} seeds in one program, mean (minimum to maximum)" if len(seeds) > 1 else "One seed"
-    milestone = "" if reached is None else f" Every seed stays at 0.95 or above from {reached:,} steps on."
+    milestone = "" if steps_to_target is None else f" Every seed stays at 0.95 or above from {steps_to_target:,} steps on."
     minutes = last["time/wall_s"] / 60
     text = f"{count}; {record['git_revision'][:7]} on {record['device']['name']}, {minutes:.0f} minutes in all.{milestone}"
     return textwrap.fill(text, WIDTH)

@@ -64,7 +64,7 @@ class _Search(NamedTuple):
 
 _PLAIN = _Search(blocks.layout, blocks.nearest, search.blocked)
 _BY_PIXELS = _Search(blocks.layout, raster.nearest, search.blocked)
-_BY_KERNELS = _Search(search.layout, search.nearest, functools.partial(search.blocked, walk=search.by_kernel))
+_BY_KERNELS = _Search(search.layout, search.nearest, functools.partial(search.blocked, walk=search.traverse_on_gpu))
 
 
 class _Path(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.pixels import Observer
-from jaxrl_vis_envs.tasks.pulled_arm import PulledArm, PulledArmConfig, pull
+from jaxrl_vis_envs.tasks.mocap_arm import MocapArm, MocapArmConfig, pull
 
 # Quaternion of the gripper pointing down. Adding it to the link's unit quaternion, as the original does, turns the target about
 # 60 % of the rotation back to this orientation in each control step.
@@ -18,7 +18,7 @@ _DOWN = (1.0, 0.0, 1.0, 0.0)
 _SETTLING_SUBSTEPS = 200
 
 
-class FetchArm(PulledArm):
+class FetchArm(MocapArm):
     """Base class of the Fetch tasks: an arm with closed fingers, in a model that extends ``fetch_reach.xml``."""
 
     action_size = 4
@@ -28,7 +28,7 @@ class FetchArm(PulledArm):
     )
 
     def __init__(
-        self, config: PulledArmConfig, mj_model: mujoco.MjModel, observer: Callable[[mujoco.MjModel], Observer] | None
+        self, config: MocapArmConfig, mj_model: mujoco.MjModel, observer: Callable[[mujoco.MjModel], Observer] | None
     ) -> None:
         """Compute the start state.
 

@@ -26,7 +26,7 @@ from jaxrl_vis_envs.pixels import Observer, PixelsConfig
 from jaxrl_vis_envs.randomization import Domain
 from jaxrl_vis_envs.tasks.fetch_arm import FetchArm
 from jaxrl_vis_envs.tasks.mjx_env import register_task
-from jaxrl_vis_envs.tasks.pulled_arm import PulledArmConfig
+from jaxrl_vis_envs.tasks.mocap_arm import MocapArmConfig
 
 _HALF_SIZE, _MASS = 0.025, 2.0  # of the box, m and kg
 # The original's state after its set-up: joints of arm and fingers (rad, m) in the model's order, and the settling box (m).
@@ -53,7 +53,7 @@ _CANDIDATES = 32  # positions sampled at once; the probability that none is acce
 
 
 @dataclasses.dataclass(frozen=True)
-class FetchPushConfig(PulledArmConfig):
+class FetchPushConfig(MocapArmConfig):
     """Settings of the task. Lengths in m."""
 
     horizon: int = 50
@@ -126,7 +126,7 @@ class FetchPush(FetchArm):
     def select_marked(cls, config: Any) -> str | None:
         return "box" if getattr(config, "goal_mask", "none") == "object" else None
 
-    def _settled(self, mj_model: mujoco.MjModel, config: PulledArmConfig) -> mujoco.MjData:
+    def _settled(self, mj_model: mujoco.MjModel, config: MocapArmConfig) -> mujoco.MjData:
         """Return the original's start, in which the fingers still penetrate the table by 2.5 mm."""
         mj_data = mujoco.MjData(mj_model)
         mj_data.qpos[:] = (*_START_JOINTS, *_START_BOX, 1.0, 0.0, 0.0, 0.0)

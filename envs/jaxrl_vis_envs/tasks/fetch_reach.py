@@ -30,7 +30,7 @@ from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.pixels import Observer, PixelsConfig
 from jaxrl_vis_envs.tasks.fetch_arm import FetchArm
 from jaxrl_vis_envs.tasks.mjx_env import register_task
-from jaxrl_vis_envs.tasks.pulled_arm import PulledArmConfig
+from jaxrl_vis_envs.tasks.mocap_arm import MocapArmConfig
 
 # Offset of every episode's start from the grip site of the stretched arm, m.
 _SETUP_OFFSET = (-0.498, 0.005, -0.231)
@@ -49,7 +49,7 @@ FingerColour = Literal["orange", "grey"]
 
 
 @dataclasses.dataclass(frozen=True)
-class FetchReachConfig(PulledArmConfig):
+class FetchReachConfig(MocapArmConfig):
     """Settings of the task. Lengths in m."""
 
     horizon: int = 50
@@ -127,7 +127,7 @@ class FetchReach(FetchArm):
         centre = np.asarray(self._start.site_xpos[self._grip])
         return centre - self.config.goal_range, centre + self.config.goal_range
 
-    def _settled(self, mj_model: mujoco.MjModel, config: PulledArmConfig) -> mujoco.MjData:
+    def _settled(self, mj_model: mujoco.MjModel, config: MocapArmConfig) -> mujoco.MjData:
         """Pull the stretched arm to the setup point, as Gym does once at construction.
 
         The arm is still moving slightly afterwards, as it is at the start of Gym's episodes.

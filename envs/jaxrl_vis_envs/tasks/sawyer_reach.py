@@ -24,7 +24,7 @@ from jaxrl_vis_envs.physics import inverse_kinematics, mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.pixels import Observer, PixelsConfig
 from jaxrl_vis_envs.tasks.mjx_env import register_task
-from jaxrl_vis_envs.tasks.pulled_arm import PulledArm, PulledArmConfig, pull
+from jaxrl_vis_envs.tasks.mocap_arm import MocapArm, MocapArmConfig, pull
 
 _SETTLING_SUBSTEPS = 1000
 _DOWN_ROTATION = np.diag([1.0, -1.0, -1.0])  # rotation matrix of the hand pointing down
@@ -34,7 +34,7 @@ _IK_STEPS = 20
 
 
 @dataclasses.dataclass(frozen=True)
-class SawyerReachConfig(PulledArmConfig):
+class SawyerReachConfig(MocapArmConfig):
     """Settings of the task. Lengths in m."""
 
     horizon: int = 25
@@ -64,7 +64,7 @@ class VisualSawyerReachConfig(PixelsConfig, SawyerReachConfig):
     for ``depth_encoding="metric"``."""
 
 
-class SawyerReach(PulledArm):
+class SawyerReach(MocapArm):
     """Sawyer reach task (see the module docstring), observed as images or as state, depending on ``observer``."""
 
     config: SawyerReachConfig

@@ -59,12 +59,12 @@ class RewardInputs(NamedTuple):
     """Observations that a model compares, in the form that encoders read.
 
     Attributes:
-        reached, goal: Prepared achieved observations and goals of B transitions, as pieces.
+        achieved_goal, goal: Prepared achieved observations and goals of B transitions, as pieces.
         image: [B, C, H, W] achieved observations, normalised.
         batch: Batch of transitions.
     """
 
-    reached: list[Piece]
+    achieved_goal: list[Piece]
     goal: list[Piece]
     image: jax.Array
     batch: Batch
@@ -102,12 +102,12 @@ class LearnedReward:
             inputs: Observations from `Networks.prepare_batch`.
             batch: Batch of transitions.
         """
-        if batch.reached is None:
-            reached, pieces = batch.observation_tp1, inputs.pieces("after")
+        if batch.achieved_goal is None:
+            achieved_goal, pieces = batch.observation_tp1, inputs.pieces("after")
         else:
-            reached = batch.reached
-            pieces = [(self.networks.prepare(scaling, reached), slice(None))]
-        compared = RewardInputs(pieces, inputs.pieces("goal"), self.networks.normalize(scaling, reached), batch)
+            achieved_goal = batch.achieved_goal
+            pieces = [(self.networks.prepare(scaling, achieved_goal), slice(None))]
+        compared = RewardInputs(pieces, inputs.pieces("goal"), self.networks.normalize(scaling, achieved_goal), batch)
         (loss, reward), gradient = jax.value_and_grad(self.loss_and_reward, has_aux=True)(state.params, compared)
         return BatchRewards(jax.lax.stop_gradient(reward), loss, gradient)
 
@@ -128,7 +128,7 @@ def make_autoencoder(networks: Networks, config: Config, resolved: Resolved) -> 
         return {"encoder": networks.init_encoder(encoder_key), "decoder": task.init(decoder_key)}
 
     def loss_and_reward(params: Params, compared: RewardInputs) -> tuple[jax.Array, jax.Array]:
-        latent = networks.encode_pieces(params, compared.reached)
+        latent = networks.encode_pieces(params, compared.achieved_goal)
         view = auxtasks.View(latent_t=latent, action=compared.batch.action, image=compared.image)
         goal_latent = networks.encode_pieces(jax.lax.stop_gradient(params), compared.goal)
         reward = cosine_reward(latent, goal_latent, resolved.reward_positive, resolved.reward_negative)
@@ -151,11 +151,11 @@ def make_classifier(networks: Networks, config: Config, resolved: Resolved) -> L
         return {"encoder": networks.init_encoder(encoder_key), "head": head.init(head_key, inputs)["params"]}
 
     def loss_and_reward(params: Params, compared: RewardInputs) -> tuple[jax.Array, jax.Array]:
-        reached, goal = (networks.encode_pieces(params, pieces) for pieces in (compared.reached, compared.goal))
-        pairs = jnp.stack([jnp.concatenate([goal, reached]), jnp.concatenate([goal, goal])])
-        of_goals, of_reached = head.apply({"params": params["head"]}, pairs)[:, 0].reshape(2, -1)
-        loss = jnp.mean(jax.nn.softplus(-of_goals)) + jnp.mean(jax.nn.softplus(of_reached))
-        fraction = jnp.minimum(2.0 * jax.nn.sigmoid(of_reached), 1.0)  # a pair in both classes, of probability 1/2, gets R+
+        achieved_goal, goal = (networks.encode_pieces(params, pieces) for pieces in (compared.achieved_goal, compared.goal))
+        pairs = jnp.stack([jnp.concatenate([goal, achieved_goal]), jnp.concatenate([goal, goal])])
+        of_goals, of_achieved = head.apply({"params": params["head"]}, pairs)[:, 0].reshape(2, -1)
+        loss = jnp.mean(jax.nn.softplus(-of_goals)) + jnp.mean(jax.nn.softplus(of_achieved))
+        fraction = jnp.minimum(2.0 * jax.nn.sigmoid(of_achieved), 1.0)  # a pair in both classes, of probability 1/2, gets R+
         return loss, resolved.reward_negative + (resolved.reward_positive - resolved.reward_negative) * fraction
 
     return LearnedReward("classifier", networks, init, loss_and_reward, optax.adam(config.ddpg.critic_learning_rate))

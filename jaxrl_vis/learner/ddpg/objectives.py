@@ -183,7 +183,7 @@ class Objectives:
             of_actor, of_critic = _next_latents(networks, copies, inputs, jax.lax.stop_gradient(latents))
             target = self._target(copies, of_actor, of_critic, batch, noise)
             main, value, keep = self._error(networks.values(critic, latents.pair, batch.action), target, batch)
-            return {MAIN: main, **self._auxiliary(critic, latents, inputs, image, batch)}, (latents, value, keep)
+            return {MAIN: main, **self._auxiliary_losses(critic, latents, inputs, image, batch)}, (latents, value, keep)
 
         return self._weighted_grad(critic_losses, inputs)
 
@@ -214,7 +214,7 @@ class Objectives:
             main = losses.actor_loss(value, action, self.config.ddpg.action_penalty)
             if self.auxiliary.weighting.log:
                 main = main + self._maximum_value
-            return {MAIN: main, **self._auxiliary(actor, latents, inputs, image, batch)}, action
+            return {MAIN: main, **self._auxiliary_losses(actor, latents, inputs, image, batch)}, action
 
         return self._weighted_grad(actor_losses, inputs)
 
@@ -299,7 +299,7 @@ class Objectives:
         latents, others = critic_latents, {}
         if has_encoder:
             latents = _encode_online(self.networks, self.auxiliary, actor, inputs, separately=False)
-            others = self._auxiliary(actor, latents, inputs, image, batch, weights)
+            others = self._auxiliary_losses(actor, latents, inputs, image, batch, weights)
         if self.auxiliary.weighting.log:
             others = {name: self.shards.global_mean(loss) for name, loss in others.items()}
         action = self.networks.act(actor, self.auxiliary.main_latents(latents.pair, weights) if has_encoder else latents.pair)
@@ -314,7 +314,7 @@ class Objectives:
             loss = of_heads[MAIN] * loss
         return loss + weighting.objective(of_heads, others), action
 
-    def _auxiliary(
+    def _auxiliary_losses(
         self,
         params: Params,
         latents: Latents,

@@ -44,8 +44,8 @@ def features_reward(encode: Callable[[jax.Array], jax.Array]) -> RewardFunction:
         encode: Images [B, C, H, W] uint8 -> vectors [B, L] of any float dtype.
     """
 
-    def reward(batch: Any, reached: jax.Array, positive: float, negative: float) -> jax.Array:
-        vector, goal_vector = jnp.split(encode(jnp.concatenate([reached, batch.goal])), 2)
+    def reward(batch: Any, achieved_goal: jax.Array, positive: float, negative: float) -> jax.Array:
+        vector, goal_vector = jnp.split(encode(jnp.concatenate([achieved_goal, batch.goal])), 2)
         return cosine_reward(vector, goal_vector, positive, negative)
 
     return reward
@@ -57,7 +57,7 @@ def features_method(encode: Callable[[jax.Array], jax.Array]) -> Method:
 
 
 def make_reward(config: Config, method: Method, mask: Callable[[jax.Array], jax.Array] | None = None) -> RewardFunction:
-    """Build the reward function of a method: (Batch, reached [B, ...], R+, R-) -> [B] float32.
+    """Build the reward function of a method: (Batch, achieved_goal [B, ...], R+, R-) -> [B] float32.
 
     Args:
         config: Configuration with the tolerance and the encoder.
@@ -78,9 +78,9 @@ def make_reward(config: Config, method: Method, mask: Callable[[jax.Array], jax.
     if method.reward == "indicator_tolerance":
         tolerance, share = config.reward.tolerance, config.reward.tolerance_share
 
-    def indicator(batch: Any, reached: jax.Array, positive: float, negative: float) -> jax.Array:
-        values = {"positive": positive, "negative": negative, "num_axes": reached.ndim - 1}
-        compared = None if mask is None else mask(reached) | mask(batch.goal)
-        return goals.indicator_reward(reached, batch.goal, tolerance=tolerance, share=share, compared=compared, **values)
+    def indicator(batch: Any, achieved_goal: jax.Array, positive: float, negative: float) -> jax.Array:
+        values = {"positive": positive, "negative": negative, "num_axes": achieved_goal.ndim - 1}
+        compared = None if mask is None else mask(achieved_goal) | mask(batch.goal)
+        return goals.indicator_reward(achieved_goal, batch.goal, tolerance=tolerance, share=share, compared=compared, **values)
 
     return indicator

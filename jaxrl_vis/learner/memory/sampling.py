@@ -167,11 +167,11 @@ class Sampler:
         if choice.target_key is not None:
             assert self.auxiliary is not None
             batch = self.auxiliary.with_targets(choice.target_key, batch, self.replay.read_stored(state, choice.indices))
-        reached = batch.observation_tp1
+        achieved_goal = batch.observation_tp1
         if self.as_goal is not None:
             # Stacked images also show motion, while goals are at rest; convert achieved observations to the same form.
-            reached = jax.vmap(self.as_goal)(batch.observation_tp1)
-            batch = batch.replace(reached=reached)
+            achieved_goal = jax.vmap(self.as_goal)(batch.observation_tp1)
+            batch = batch.replace(achieved_goal=achieved_goal)
             if batch.goal.ndim == 2:  # of states; the replay repeats a goal's newest image itself
                 batch = batch.replace(observations=batch.observations.at[1].set(jax.vmap(self.as_goal)(batch.goal)))
         if choice.is_replaceable is not None:
@@ -181,35 +181,35 @@ class Sampler:
         batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
         if self.resolved.method.is_learned:
             return batch  # the learner computes rewards with its current model (`learned_reward`)
-        return batch.replace(reward=self.reward(batch, reached, choice.clutter_end))
+        return batch.replace(reward=self.reward(batch, achieved_goal, choice.clutter_end))
 
     def _with_n_step_rewards(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
         """Replace rewards by discounted sums of the oracle's over up to ``n_step`` steps, and adapt the discounts."""
         episode, time = choice.indices
         after = time[:, None] + 1 + jnp.arange(self.config.study.n_step)  # slots that the steps lead to, [B, n]
         is_step = after <= self.replay.horizon
-        reached = state.episodes.states[episode[:, None], jnp.minimum(after, self.replay.horizon)]
+        achieved_goal = state.episodes.states[episode[:, None], jnp.minimum(after, self.replay.horizon)]
         values = {"positive": self.resolved.reward_positive, "negative": self.resolved.reward_negative}
-        rewards = goals.oracle_reward(reached, batch.goal_state[:, None], self.threshold, **values)
+        rewards = goals.oracle_reward(achieved_goal, batch.goal_state[:, None], self.threshold, **values)
         weights = is_step * self.resolved.discount ** jnp.arange(self.config.study.n_step)
         return batch.replace(
             reward=jnp.sum(weights * rewards, axis=1),
             discount=self.resolved.discount ** jnp.sum(is_step, axis=1).astype(jnp.float32),
         )
 
-    def reward(self, batch: Batch, reached: jax.Array, clutter_end: jax.Array | None = None) -> jax.Array:
+    def reward(self, batch: Batch, achieved_goal: jax.Array, clutter_end: jax.Array | None = None) -> jax.Array:
         """Compute the rewards [B] float32.
 
         Args:
             batch: Relabelled transitions.
-            reached: [B, ...] achieved observations, converted to goals.
+            achieved_goal: [B, ...] achieved observations, converted to goals.
             clutter_end: See `Choice`.
         """
         values = {"positive": self.resolved.reward_positive, "negative": self.resolved.reward_negative}
         method = self.resolved.method
         if method.reward == "oracle":
             return self._estimated_reward(batch, clutter_end)
-        return self._reward(batch, reached, values["positive"], values["negative"])
+        return self._reward(batch, achieved_goal, values["positive"], values["negative"])
 
     @functools.cached_property
     def _reward(self) -> RewardFunction:

@@ -155,7 +155,7 @@ class Programs:
                             else:
                                 lowered = function.lower(*arguments)
                         futures[name] = pool.submit(lowered.compile)
-                    self._finish(missing, concurrent_work)
+                    self._run_concurrent_work(missing, concurrent_work)
                     self._store({name: future.result() for name, future in futures.items()})
                 if traces is not None:
                     traces.write()
@@ -178,7 +178,7 @@ class Programs:
             return None
         return TraceCache(Path(cache) / "programs", identity, self.shapes, JIT_OPTIONS)
 
-    def _finish(self, names: Sequence[str], concurrent_work: Callable[[], None]) -> None:
+    def _run_concurrent_work(self, names: Sequence[str], concurrent_work: Callable[[], None]) -> None:
         """Do all work that can overlap with XLA's compilation."""
         if "init" in names and not distributed.is_multi_process():
             # Extracting the data of keys, as in saving, is also a compiled program.

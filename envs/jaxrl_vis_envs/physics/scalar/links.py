@@ -47,7 +47,7 @@ class FixedFrame(NamedTuple):
     """A frame fixed to a link.
 
     Attributes:
-        link: Index of the link's joint, `WORLD`, or a mocap body's link.
+        link: Index of the link's joint, `WORLD`, or the link of a mocap body or of the free body (`mocap_link`).
         rotation: [3, 3] float64, axes in the link's frame.
         position: [3] float64, origin in the link's frame, m.
     """

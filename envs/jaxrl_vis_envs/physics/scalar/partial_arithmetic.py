@@ -135,7 +135,7 @@ _PI = (3.140625, math.pi - 3.140625)  # the first part has so few digits that it
 
 
 def sine_and_cosine(angle: Any) -> tuple[Any, Any]:
-    """Return sine and cosine of an array of angles (rad), within 1e-7 for up to some thousand turns.
+    """Return the sine and cosine of an array of angles (rad), to within 3e-7 for up to a thousand turns.
 
     Library functions handle arguments of any size with longer code, which would appear twice per joint.
     """

@@ -16,7 +16,7 @@ from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.gpu import kernel, light_grid
 from jaxrl_vis_envs.render.gpu.tiles import pack_bits
-from jaxrl_vis_envs.render.gpu.walk import LANES, TILE, Refs, by_kernel, in_plain_jax
+from jaxrl_vis_envs.render.gpu.walk import LANES, TILE, Refs, traverse_in_plain_jax, traverse_on_gpu
 from jaxrl_vis_envs.render.model import hierarchies, reading
 from jaxrl_vis_envs.render.pixel import blocks, lights, raycast, shapes
 from jaxrl_vis_envs.render.pixel.arithmetic import Vector
@@ -101,7 +101,7 @@ def nearest_triangle(
         nearest=jnp.broadcast_to(scene.znear, depth.shape),
         farthest=depth,
     )
-    best, hit, row = by_kernel(refs, any_hit=False, interpret=interpret)
+    best, hit, row = traverse_on_gpu(refs, any_hit=False, interpret=interpret)
     is_hit = hit >= 0
     row = trees.rows.at[jnp.maximum(row, 0)].get(mode="promise_in_bounds")
     owner = trees.objects.at[jnp.maximum(hit, 0)].get(mode="promise_in_bounds")
@@ -109,7 +109,7 @@ def nearest_triangle(
 
 
 def blocked(
-    scene: Scene, unit: shapes.UnitShapes, segments: Segments, light: lights.Light, walk: Walk = in_plain_jax
+    scene: Scene, unit: shapes.UnitShapes, segments: Segments, light: lights.Light, walk: Walk = traverse_in_plain_jax
 ) -> jax.Array:
     """Return True where a segment enters a mesh or a height field, of any transparency: [P] bool. Not differentiable.
 
@@ -118,7 +118,7 @@ def blocked(
         unit: Rendered objects.
         segments: [P], towards the light, and not beyond it.
         light: The light.
-        walk: `walk.by_kernel` or `walk.in_plain_jax`.
+        walk: `walk.traverse_on_gpu` or `walk.traverse_in_plain_jax`.
     """
     scene, unit, segments = jax.lax.stop_gradient((scene, unit, segments))
     trees = scene.hierarchies
@@ -242,6 +242,6 @@ def probe_program() -> Any:
         segments = Segments((one,) * 3, (one,) * 3, one, one)
         three = one[:3]
         light = lights.Light(True, False, True, None, three, three, three, three, None, None, None)
-        return nearest_triangle(scene, unit, Rays(one, one), one), blocked(scene, unit, segments, light, by_kernel)
+        return nearest_triangle(scene, unit, Rays(one, one), one), blocked(scene, unit, segments, light, traverse_on_gpu)
 
     return jax.jit(search).trace(scene, unit, pixels)

@@ -130,7 +130,7 @@ class _State(NamedTuple):
     row: jax.Array
 
 
-def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Array]:
+def traverse_on_gpu(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Array]:
     """Traverse the hierarchies along rays, by the kernel.
 
     Args:
@@ -156,8 +156,8 @@ def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Ar
     )(*refs)
 
 
-def in_plain_jax(refs: Refs, any_hit: bool) -> list[jax.Array]:
-    """Traverse the hierarchies as `by_kernel` does, along all rays at once. Rays of one call should be few, and coherent."""
+def traverse_in_plain_jax(refs: Refs, any_hit: bool) -> list[jax.Array]:
+    """Traverse the hierarchies as `traverse_on_gpu` does, along all rays at once. Rays of a call should be few and coherent."""
     return _walk(refs, jnp.arange(refs.nearest.shape[0], dtype=jnp.int32), any_hit)
 
 
@@ -198,7 +198,7 @@ def _kernel(*refs: Any, any_hit: bool) -> None:
 
 
 def _walk(refs: Refs, ray: jax.Array, any_hit: bool) -> list[jax.Array]:
-    """Traverse the hierarchies along some rays, see `by_kernel`.
+    """Traverse the hierarchies along some rays, see `traverse_on_gpu`.
 
     Args:
         refs: Memory blocks of a kernel, or arrays.
@@ -215,7 +215,7 @@ def _walk(refs: Refs, ray: jax.Array, any_hit: bool) -> list[jax.Array]:
 
 
 def _found(state: _State, any_hit: bool) -> list[jax.Array]:
-    """Return what `by_kernel` returns."""
+    """Return what `traverse_on_gpu` returns."""
     return [state.hit] if any_hit else [state.best, state.hit, state.row]
 
 
@@ -360,7 +360,10 @@ def _meets_box(state: _State, low: jax.Array, high: jax.Array, nearest: jax.Arra
 
 
 def _test_leaf(refs: Refs, nearest: jax.Array, state: _State, leaf: jax.Array) -> _State:
-    """Intersect rays with the triangles of leaves, given by their first row of ``maps`` [L], -1 for none."""
+    """Return the state after intersecting the ray of each lane with a leaf's triangles.
+
+    ``leaf`` [L] is the leaf's first row in ``maps``, -1 for none.
+    """
     (start, direction), best, hit, row = state.ray[:2], state.best, state.hit, state.row
     for number in range(hierarchies.LEAF):
         place = leaf + number

@@ -23,7 +23,7 @@ class Light(NamedTuple):
     Attributes:
         is_directional: True for a directional light.
         has_highlights: True if the light can cause specular highlights.
-        has_shadows: True if the light casts shadows.
+        casts_shadows: True if the light casts shadows.
         position: Position, m; None for a directional light.
         direction: Unit vector along which the light shines.
         ambient: Ambient colour.
@@ -36,7 +36,7 @@ class Light(NamedTuple):
 
     is_directional: bool
     has_highlights: bool
-    has_shadows: bool
+    casts_shadows: bool
     position: jax.Array | None
     direction: jax.Array
     ambient: jax.Array
@@ -103,7 +103,7 @@ class LightFacts(NamedTuple):
 
     is_directional: bool
     has_highlights: bool
-    has_shadows: bool
+    casts_shadows: bool
     is_spot: bool
 
 

@@ -82,7 +82,7 @@ def light_surface(
         return _light_points(scene, unit, lights, row, hit, to_camera)
     # Corners are lit, but shadows fall on points.
     corners = surface.corners(row, hit)
-    lit = [_shadow_mask(scene, unit, light, hit, blocked, corners) if light.has_shadows else None for light in lights]
+    lit = [_shadow_mask(scene, unit, light, hit, blocked, corners) if light.casts_shadows else None for light in lights]
     colour: Vector = (0.0, 0.0, 0.0)
     for share, corner in corners:
         to_camera = normalized(tuple(-p for p in corner.point))
@@ -110,7 +110,7 @@ def _light_points(
         if lit is not None:
             mask = lit[number]
         else:
-            mask = _shadow_mask(scene, unit, light, hit, None) if light.has_shadows else None
+            mask = _shadow_mask(scene, unit, light, hit, None) if light.casts_shadows else None
         factors = lighting.light_factors(light, hit.point, hit.normal, to_camera, row.exponent, mask)
         for channel in range(3):
             coloured[channel] += factors[0] * light.ambient[channel] + factors[1] * light.diffuse[channel]

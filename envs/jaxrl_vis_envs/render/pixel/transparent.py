@@ -125,7 +125,7 @@ def face_colour(
 ) -> tuple[tuple, jax.Array]:
     """Compute colour (three [P]) and alpha [P] of one face; alpha is 0 where the face is not visible."""
     # Only opaque objects receive shadows.
-    unshadowed = [light._replace(has_shadows=False) for light in lights.unpack(scene, light_table)]
+    unshadowed = [light._replace(casts_shadows=False) for light in lights.unpack(scene, light_table)]
     face: Any = shade.light_surface(scene, unit, unshadowed, sheet.row, sheet.hit, rays)
     alpha = alpha_of(scene, unit, sheet.index)
     image = None

@@ -43,7 +43,7 @@ class Plan:
         batch: Number of crops per update.
         crop: Height and width of a crop, pixels.
         rate: Peak learning rate of the generator.
-        average: Decay rate of the exponential moving average of the generator's parameters; lower in the first updates.
+        ema_decay: Decay rate of the exponential moving average of the generator's parameters; lower in the first updates.
         seed: Seed of initialisation, crops and augmentation.
     """
 
@@ -54,7 +54,7 @@ class Plan:
     batch: int = 16
     crop: int = 384
     rate: float = 1e-3
-    average: float = 0.998
+    ema_decay: float = 0.998
     seed: int = 0
 
 

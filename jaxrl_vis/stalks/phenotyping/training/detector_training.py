@@ -37,7 +37,7 @@ class Plan:
         batch: Batch size of images.
         crops: Batch size of stalk crops.
         rate: Peak learning rate.
-        average: Decay rate of the exponential moving average of the parameters; lower in the first updates.
+        ema_decay: Decay rate of the exponential moving average of the parameters; lower in the first updates.
         seed: Random seed.
     """
 
@@ -48,7 +48,7 @@ class Plan:
     batch: int = 8
     crops: int = 32
     rate: float = 1e-3
-    average: float = 0.998
+    ema_decay: float = 0.998
     seed: int = 0
 
 

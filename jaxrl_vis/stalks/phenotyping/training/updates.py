@@ -29,7 +29,7 @@ class Schedule(Protocol):
     @property
     def rate(self) -> float: ...  # noqa: D102
     @property
-    def average(self) -> float: ...  # noqa: D102
+    def ema_decay(self) -> float: ...  # noqa: D102
 
 
 def run_updates(update: Update, pool: Pool, plan: Schedule, start_time: float, report: Report, report_interval: float) -> int:
@@ -61,7 +61,7 @@ def run_updates(update: Update, pool: Pool, plan: Schedule, start_time: float, r
             break
         rate = plan.rate * min((step + 1) / 200.0, 1.0) * 0.5 * (1.0 + np.cos(np.pi * progress))
         # The decay rate is lower at first, so that the average forgets the random initialisation.
-        rates = jnp.float32(rate), jnp.float32(min(plan.average, (1.0 + step) / (10.0 + step)))
+        rates = jnp.float32(rate), jnp.float32(min(plan.ema_decay, (1.0 + step) / (10.0 + step)))
         made = update(step, rates)
         if made is None:
             pool.fill(len(pool.examples) + 1)

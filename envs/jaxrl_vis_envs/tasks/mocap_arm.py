@@ -20,7 +20,7 @@ CONTROL_PERIOD = 0.04  # s
 
 
 @dataclasses.dataclass(frozen=True)
-class PulledArmConfig(TaskConfig):
+class MocapArmConfig(TaskConfig):
     """Settings of the task. Lengths in m."""
 
     action_scale: float = 0.05
@@ -37,7 +37,7 @@ class PulledArmConfig(TaskConfig):
         checks.integers(self, "substeps", minimum=4)  # the weld's time constant is 20 ms
 
 
-class PulledArm(MjxGoalEnv):
+class MocapArm(MjxGoalEnv):
     """Base class of tasks with an arm without motors, pulled by its hand. By default, goals are grip positions (m, world)."""
 
     distance_unit = "m"
@@ -45,7 +45,7 @@ class PulledArm(MjxGoalEnv):
 
     def __init__(
         self,
-        config: PulledArmConfig,
+        config: MocapArmConfig,
         mj_model: mujoco.MjModel,
         hand: str,
         observer: Callable[[mujoco.MjModel], Observer] | None,
@@ -67,7 +67,7 @@ class PulledArm(MjxGoalEnv):
         super().__init__(config, mj_model, observer)
 
     @abc.abstractmethod
-    def _settled(self, mj_model: mujoco.MjModel, config: PulledArmConfig) -> mujoco.MjData:
+    def _settled(self, mj_model: mujoco.MjModel, config: MocapArmConfig) -> mujoco.MjData:
         """Return the physics state in which every episode starts, after the arm was pulled there; it may still be moving."""
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
