@@ -24,7 +24,7 @@ BIN := .venv/bin
 STAMPS := .venv/stamps
 ACCELERATOR := $(shell nvidia-smi -L >/dev/null 2>&1 && echo gpu || echo base)
 
-.PHONY: help train test fuzz docs page page-check lint format bench-cpu tables stale verify-release pins clean
+.PHONY: help train test test-all fuzz docs page page-check lint format bench-cpu tables stale verify-release pins clean
 .DEFAULT_GOAL := help
 
 help: ## Show this list
@@ -35,7 +35,10 @@ help: ## Show this list
 train: $(STAMPS)/$(ACCELERATOR) ## Train on VisualFetchReach; curve.png and video.gif land in RUN_DIR
 	@$(BIN)/jaxrl-vis train --preset $(PRESET) --seed $(SEED) --run-dir "$(RUN_DIR)" $(ARGS)
 
-test: $(STAMPS)/dev ## Run the tests
+test: $(STAMPS)/dev ## Run the tests, except slow ones
+	@$(BIN)/python -m pytest -n $(WORKERS) -m "not slow" $(ARGS)
+
+test-all: $(STAMPS)/dev ## Run all tests
 	@$(BIN)/python -m pytest -n $(WORKERS) $(ARGS)
 
 fuzz: $(STAMPS)/dev ## Try EXAMPLES=2000 corrupted files of each kind on their readers, other ones each time

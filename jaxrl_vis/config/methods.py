@@ -80,9 +80,9 @@ HEAD_WEIGHTINGS = ("cosine", "ol_aux", "gradnorm", *GRAMIAN_WEIGHTINGS)
 EPS_WEIGHTINGS = ("fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation", *GRAMIAN_WEIGHTINGS, "db_mtl")
 LIMITED_WEIGHTINGS = ("ol_aux", "ol_aux_ablation", "gradnorm", *LOSS_WEIGHTINGS, *GRAMIAN_WEIGHTINGS)
 
-WeightingName = Annotated[
-    str, Names((*MAIN_LOSS_WEIGHTINGS, *LOSS_WEIGHTINGS, "gradnorm", *GRAMIAN_WEIGHTINGS, *DIRECTION_WEIGHTINGS))
-]
+WEIGHTING_NAMES = (*MAIN_LOSS_WEIGHTINGS, *LOSS_WEIGHTINGS, "gradnorm", *GRAMIAN_WEIGHTINGS, *DIRECTION_WEIGHTINGS)
+"""Names of the built-in weightings."""
+WeightingName = Annotated[str, Names(WEIGHTING_NAMES)]
 AuxTaskName = Annotated[str, Names(("forward_dynamics", "inverse_dynamics", "egomotion", "autoencoder", "optical_flow"))]
 ALGORITHMS = ("ddpg", "td3", "contrastive")
 """Names of the built-in algorithms."""

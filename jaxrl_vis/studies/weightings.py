@@ -2,14 +2,14 @@
 
 import colorsys
 
+from jaxrl_vis.config.methods import WEIGHTING_NAMES
 from jaxrl_vis.studies import ol_aux
 from jaxrl_vis.studies.engine.study import Family, Study, Variant
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND
-from jaxrl_vis.weighting import WEIGHTINGS
 
 _SHARED = ("none", "sum", "balance", "cosine", "ol_aux_5")
 """Variants that are those of figure 5.4."""
-_OTHERS = [name for name in WEIGHTINGS if name not in (*_SHARED, "none_log", "fixed", "ol_aux", "ol_aux_ablation")]
+_OTHERS = [name for name in WEIGHTING_NAMES if name not in (*_SHARED, "none_log", "fixed", "ol_aux", "ol_aux_ablation")]
 
 
 def _colour(number: int) -> str:

@@ -59,7 +59,7 @@ def test_textures_can_be_left_out() -> None:
 
 @pytest.mark.parametrize(
     ("content", "complaint"),
-    [(None, "no scene .*finger, fetch_reach, primitives"), ("<mujoco/>", "no camera"), ("<robot", "no MuJoCo model")],
+    [(None, "no scene .*finger, fetch_reach, primitives"), ("<mujoco/>", "no camera"), ("<robot", "is not a MuJoCo model")],
 )
 def test_invalid_scenes_raise_one_line(content: str | None, complaint: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.xml"

@@ -15,6 +15,7 @@ from benchmarks.soak.soak import Soak
 FAULTS, SEED = 2, 156  # SIGKILL during a save, then SIGTERM
 
 
+@pytest.mark.slow
 def test_a_minute_of_faults(tmp_path, monkeypatch):
     options = list(run_process.OPTIONS)
     options[options.index("--env-steps") + 1] = str(80 * run_process.STEPS)  # a third of a soak's runs

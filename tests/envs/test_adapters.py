@@ -387,7 +387,6 @@ def test_brax_ppo_learns():
     assert float(jnp.abs(action - goal).mean()) < 0.12  # .36 for staying where it is
 
 
-@pytest.mark.slow
 def test_brax_sac_trains():
     env, rewards = BraxEnv(told(), reward="dense"), []
     with share_jax_with_brax():

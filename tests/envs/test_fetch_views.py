@@ -49,6 +49,7 @@ def test_the_camera_is_mujocos_free_camera_at_their_settings():
     np.testing.assert_allclose(intrinsic_matrix(env()._observer.scene)[1, 1], focal, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_goal_images_show_where_ten_proportional_steps_lead():
     state, task = states(), jaxrl_vis_envs.make("FetchReach")
     assert state.obs["desired_goal"].shape == (8, 3, SIZE, SIZE)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+SLOW = ("02_new_environment", "05_phenotyping", "07_weighting")
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
 
 # Figures, and videos of a whole run as a page shows them wherever the notebook is read.
@@ -81,7 +82,11 @@ def kernel(tmp_path_factory: pytest.TempPathFactory, nbclient: Any) -> Iterator[
     nbclient.util.run_sync(manager.shutdown_kernel)(now=True)
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=pytest.mark.slow if path.stem in SLOW else ()) for path in NOTEBOOKS],
+    ids=lambda path: path.stem,
+)
 def test_notebook_runs(path: Path, tmp_path: Path, kernel: Any, nbformat: Any, nbclient: Any) -> None:
     notebook = nbformat.read(path, as_version=4)
     notebook.cells.insert(0, nbformat.v4.new_code_cell(f"%reset -f\n%cd -q {tmp_path}"))

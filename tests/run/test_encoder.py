@@ -20,6 +20,7 @@ def registered(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.mark.slow
 def test_an_encoder_is_trained_and_makes_rewards(capsys: pytest.CaptureFixture[str]) -> None:
     train = ["encoder", "VisualPoint", "--image-size", "16", "--episodes", "16", "--latent-size", "8"]
     assert cli.main([*train, "--updates", "60", "--out", "e.npz"]) == 0

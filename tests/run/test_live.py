@@ -91,7 +91,7 @@ def test_goals_are_placed_shown_and_kept_within_their_box(session: live.Session)
 
 
 def test_tasks_without_poses_are_refused(policy: Policy) -> None:
-    with pytest.raises(RequestError, match="--live shows tasks on MJX, and VisualPoint is none"):
+    with pytest.raises(RequestError, match="--live shows tasks on MJX, and VisualPoint is not one"):
         live.Session(dataclasses.replace(policy, env=probes.GoWhereTold()))
 
 

@@ -240,7 +240,6 @@ def test_evaluate_and_play_a_run(straight, tmp_path, monkeypatch):
         restored_run.evaluate_run(tmp_path / "new")
 
 
-@pytest.mark.slow
 def test_the_real_program_resumes_bit_for_bit(tmp_path, capsys):
     """The same as above with physics, cameras and networks. Traced once: the three runs share the program."""
     config = preset("debug", env="VisualReacher", full_checkpoint_interval=2)
@@ -264,7 +263,6 @@ def test_the_real_program_resumes_bit_for_bit(tmp_path, capsys):
     assert line.startswith("replay ")
 
 
-@pytest.mark.slow
 def test_the_script_runs(tmp_path, checkout, capsys, monkeypatch):
     monkeypatch.setattr(trainer, "make_train_step", small_program.make_train_step)
     script = runpy.run_path(str(checkout / "notebooks" / "train.py"))
