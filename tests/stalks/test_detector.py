@@ -271,7 +271,7 @@ def test_images_of_several_sizes_are_batched_together():
 def trained():
     said = []
     sources = [iter([drawing(seed) for seed in range(24)])]
-    plan = Plan(steps=160, images=24, first=24, batch=4, crops=4, rate=4e-3, average=0.9)
+    plan = Plan(steps=160, images=24, first=24, batch=4, crops=4, rate=4e-3, ema_decay=0.9)
     params, steps = train(sources, TINY, plan, lambda step, *rest: said.append((step, rest[2])), report_interval=0.0)
     return params, steps, said
 

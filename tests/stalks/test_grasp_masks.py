@@ -59,7 +59,7 @@ def test_varied_crops_keep_their_masks():
 def test_generators_learn_to_paint_stripes(loss, tmp_path):
     settings = Settings(loss, (8, 16))
     reports = []
-    plan = Plan(steps=100, images=4, first=4, batch=4, crop=32, rate=2e-2, average=0.9)
+    plan = Plan(steps=100, images=4, first=4, batch=4, crop=32, rate=2e-2, ema_decay=0.9)
     params, steps = train([map(striped, range(4))], settings, plan, lambda *parts: reports.append(parts), report_interval=0.0)
     assert steps == 100 and reports and all(np.isfinite(list(report[3].values())).all() for report in reports)
     path = tmp_path / "w.safetensors"
