@@ -3,12 +3,10 @@
 from benchmarks.claims import columns as c
 from benchmarks.claims.markdown import Row, table
 from benchmarks.claims.records import Record, study
-from benchmarks.ledger.records import RESULTS
-from jaxrl_vis.studies.ol_aux import FETCH, FINGER, HAND
-from jaxrl_vis.studies.weightings import FAMILY
+from jaxrl_vis.studies.weightings import FAMILY, STUDIES
 
 GUIDE = "docs/weighting.md"
-BUDGETS = {FETCH: 60_000, HAND: 300_000, FINGER: 300_000}
+_BUDGETS = STUDIES["weightings"].steps
 _BASELINE = "sum"
 
 
@@ -23,9 +21,9 @@ def _records(task: str) -> dict[str, Record]:
     return records
 
 
-def _task_table(task: str, records: dict[str, Record]) -> str:
+def task_table(task: str, records: dict[str, Record]) -> str:
     """Return the table of a task, by descending mean success."""
-    budget, base = BUDGETS[task], records[_BASELINE]
+    budget, base = _BUDGETS[task], records[_BASELINE]
     order = sorted(records, key=lambda variant: -records[variant].means(budget).mean())
     columns = [
         c.seeds(),
@@ -39,7 +37,6 @@ def _task_table(task: str, records: dict[str, Record]) -> str:
 
 def tables() -> dict[str, dict[str, str]]:
     """Return the tables, page -> marker -> text; none without records."""
-    if not (RESULTS / "studies" / FAMILY.name).is_dir():
-        return {}
-    by_task = {task: _records(task) for task in BUDGETS}
-    return {GUIDE: {task: _task_table(task, records) for task, records in by_task.items() if _BASELINE in records}}
+    by_task = {task: _records(task) for task in _BUDGETS}
+    texts = {task: task_table(task, records) for task, records in by_task.items() if _BASELINE in records}
+    return {GUIDE: texts} if texts else {}

@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 import jaxrl_vis
+import jaxrl_vis_envs
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.report.videos import write_images
 from jaxrl_vis.run.storage.folder import read_config
@@ -57,14 +58,15 @@ def main() -> None:
     config = read_config(shipped.find(options.run_dir))
     env, channels = policy.env, {"rgbd": 4, "rgb": 3, "depth": 1}[config.environment.pixels]
     large = make_env(config.replace(image_size=SIZE, pixels="rgb"))
-    reset, step = jax.jit(env.reset), jax.jit(env.step)
-    draw, draw_goal = jax.jit(large.observe), jax.jit(lambda key: large.reset(key).obs["desired_goal"])
+    reset, step, draw = (jaxrl_vis_envs.jit(function) for function in (env.reset, env.step, large.observe))
+    draw_goal = jaxrl_vis_envs.jit(lambda key: large.reset(key).obs["desired_goal"])
+    caption = "what it observes" + (" (depth)" if channels == 1 else "")
     images, seconds = [], []
     for key in jax.random.split(jax.random.key(1), options.episodes):
         state, goal, rested = reset(key), last_image(draw_goal(key), 3), 0
         for _ in range(env.horizon):
             observed = last_image(state.obs["observation"], channels)
-            images.append(compose({"robot": last_image(draw(state), 3), "what it observes": observed, "goal image": goal}))
+            images.append(compose({"robot": last_image(draw(state), 3), caption: observed, "goal image": goal}))
             seconds.append(SECONDS)
             rested = rested + 1 if float(state.metrics["success"]) else 0
             if rested > RESTED:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.claims import columns, pages, prose
+from benchmarks.claims import columns, pages, prose, weightings
 from benchmarks.claims.markdown import Row, table
 from benchmarks.claims.prose import Sentence
 from benchmarks.claims.records import Record, study
@@ -29,6 +29,23 @@ def record(name: str, *seeds: list[float]) -> Record:
 def test_every_published_figure_is_that_of_the_records():
     done = subprocess.run([sys.executable, "benchmarks/check_claims.py"], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_weightings_are_ordered_by_success_and_compared_with_the_sum():
+    def run(name: str, level: float) -> Record:
+        time = {"time/wall_s": 50.0, "time/compile_s": 20.0}
+        rows = [
+            {"seed": seed, "env_steps": steps, "eval/success": level + seed / 100, **time}
+            for steps in (30_000, 60_000)
+            for seed in range(5)
+        ]
+        return Record(name, tuple(rows), frozenset({"abc on a GPU"}))
+
+    text = weightings.task_table("VisualFetchReach", {"sum": run("a", 0.5), "uniform": run("b", 0.8)})
+    first, second = (line.split(" | ") for line in text.splitlines()[2:4])
+    assert (first[0], second[0]) == ("| `uniform`", "| `sum`")
+    assert first[2].startswith("0.820 (") and first[3] == "0.008" and first[-1] == "30 |"
+    assert second[2].startswith("0.520 (") and "0.008" not in second
 
 
 def test_cells_say_what_can_be_counted_by_hand():

@@ -25,8 +25,8 @@ def rows(records: list[dict[str, Any]]) -> str:
     lines = ["| " + " | ".join(["task", "reward", *COLUMNS.values()]) + " |", "|" + "---|" * (len(COLUMNS) + 2)]
     for record in records:
         task = _task(record["audit"])
-        for name, figures in record["rewards"].items():
-            cells = [task, _reward(name), *(f"{figures[key]:.3f}" for key in COLUMNS)]
+        for name, measures in record["rewards"].items():
+            cells = [task, _reward(name), *(f"{measures[key]:.3f}" for key in COLUMNS)]
             lines.append("|" + "".join(f" {cell} |" if cell else " |" for cell in cells))
             task = ""
     origins = frozenset(f"{(record['revision'] or 'unknown')[:7]} on {record['device']}" for record in records)
