@@ -15,6 +15,8 @@ LAB, GUIDE = "docs/lab/ol_aux.md", "docs/auxiliary_losses.md"
 VIEW = "view=fingertips-tip_marks=faint-depth_encoding=zbuffer"
 BUDGETS = {FETCH: 240_000, HAND: 1_000_000, FINGER: 1_000_000}
 """Environment steps up to which success is averaged, by task; all records reach them."""
+OPTION_BUDGETS = {FETCH: BUDGETS[FETCH], HAND: 600_000}
+"""The same for options of OL-AUX-5."""
 LABELS = {
     "none": "without",
     "balance": "balance",
@@ -187,14 +189,20 @@ def _main() -> str:
     return table(["`paper`", "auxiliary losses"], rows, columns)
 
 
-def _options() -> str:
-    """Return the table of OL-AUX-5's options on FetchReach, with the tuning seeds."""
-    base, budget = run(FETCH, "ol_aux_5"), BUDGETS[FETCH]
-    rows = [Row("OL-AUX-5", base)]
-    rows += [Row(f"`{variant}`", run(FETCH, variant)) for variant in OPTIONS if _is_kept(FETCH, variant)]
+def options(task: str) -> dict[str, Record]:
+    """Return the kept runs of OL-AUX-5's options on a task, with the tuning seeds, by variant."""
+    return {variant: run(task, variant) for variant in OPTIONS if _is_kept(task, variant)}
+
+
+def _options(task: str) -> str:
+    base, budget = run(task, "ol_aux_5"), OPTION_BUDGETS[task]
+    rows = [Row("OL-AUX-5", base), *(Row(f"`{variant}`", record) for variant, record in options(task).items())]
     weights = [f"train/weight/{name}" for name in AUX_TASKS]
-    total = c.Column("sum of weights at the end", lambda record: f"{sum(record.median(metric=name) for name in weights):.0f}")
-    return table([FETCH], rows, [c.mean_success(budget), c.p_value_against(base, "OL-AUX-5", budget), total, c.names()])
+    total = c.Column(
+        f"sum of weights at {c.format_steps(budget)}",
+        lambda record: f"{sum(record.median(budget, metric=name) for name in weights):.0f}",
+    )
+    return table([task], rows, [c.mean_success(budget), c.p_value_against(base, "OL-AUX-5", budget), total, c.names()])
 
 
 def _is_kept(task: str, variant: str) -> bool:
@@ -223,7 +231,8 @@ def tables() -> dict[str, dict[str, str]]:
             "fresh_fetch": _fresh(FETCH),
             "fresh_hand": _fresh(HAND),
             "fresh_finger": _fresh(FINGER),
-            "options": _options(),
+            "options_fetch": _options(FETCH),
+            "options_hand": _options(HAND),
             "departures": _departures(),
             "gaps": _undone_departures(),
         },

@@ -51,15 +51,41 @@ def _logarithm() -> Iterator[Sentence]:
 
 
 def _sum() -> Iterator[Sentence]:
-    for task, place, verdict in ((FINGER, "the finger", "better"), (FETCH, "FetchReach", "worse")):
+    places = ((FINGER, "on the finger", "better"), (HAND, "likewise on the hand", "better"), (FETCH, "on FetchReach", "worse"))
+    for task, place, verdict in places:
         plain, *others = (ol_aux.claim(task, name) for name in ("sum", "none", "balance", "ol_aux_5"))
         budget = ol_aux.BUDGETS[task]
         none, balance, ours = (f"({_p(plain, other, budget)})" for other in others)
         conjunction = "and" if verdict == "better" else "as well as"
-        quote = f"on {place} {verdict} than none {none} {conjunction}"
+        quote = f"{place} {verdict} than none {none} {conjunction}"
         quote += f" worse than balancing {balance} and OL-AUX-5 {ours}" if verdict == "better" else f" than balancing {balance}"
         is_supported = [c.verdict(plain, other, budget) for other in others] == [verdict, "worse", "worse"]
         yield Sentence(LAB, quote, plain.name, is_supported)
+
+
+def _fixed() -> Iterator[Sentence]:
+    p, verdicts = {}, {}
+    for task, budget in ol_aux.BUDGETS.items():
+        tenth, *others = (ol_aux.claim(task, name) for name in ("fixed_0.1", "none", "balance"))
+        p[task] = [f"({_p(tenth, other, budget)})" for other in others]
+        verdicts[task] = [c.verdict(tenth, other, budget) for other in others]
+    name = ol_aux.claim(HAND, "fixed_0.1").name
+    quote = f"is better than none on FetchReach {p[FETCH][0]}, the hand {p[HAND][0]} and the finger {p[FINGER][0]}."
+    yield Sentence(LAB, quote, name, all(none == "better" for none, _ in verdicts.values()))
+    quote = f"on the hand {p[HAND][1]} and the finger {p[FINGER][1]}, and level with it on FetchReach {p[FETCH][1]}."
+    yield Sentence(LAB, quote, name, [verdicts[task][1] for task in (HAND, FINGER, FETCH)] == ["worse", "worse", "level"])
+
+
+def _cosine() -> Iterator[Sentence]:
+    on_none = "worse than none on FetchReach {} and better on the hand {} and the finger {}."
+    of_sum = "is better on the hand {}, worse on the finger {}, and level on FetchReach {}."
+    for reference, order, verdicts, quote in (
+        ("none", (FETCH, HAND, FINGER), ["worse", "better", "better"], on_none),
+        ("sum", (HAND, FINGER, FETCH), ["worse", "better", "level"], of_sum),  # verdicts on cosine, quote on the sum
+    ):
+        pairs = [(ol_aux.claim(task, "cosine"), ol_aux.claim(task, reference), ol_aux.BUDGETS[task]) for task in order]
+        p = [f"({_p(*pair)})" for pair in pairs]
+        yield Sentence(LAB, quote.format(*p), pairs[0][0].name, [c.verdict(*pair) for pair in pairs] == verdicts)
 
 
 def _release() -> Iterator[Sentence]:
@@ -75,12 +101,29 @@ def _release() -> Iterator[Sentence]:
 
 
 def _ol_aux_options() -> Iterator[Sentence]:
-    ours, budget = ol_aux.run(FETCH, "ol_aux_5"), ol_aux.BUDGETS[FETCH]
-    tried = {name: ol_aux.run(FETCH, f"ol_aux_5_{name}") for name in ("eps_0.001", "beta_100", "heads")}
-    verdicts = {name: c.verdict(record, ours, budget) for name, record in tried.items()}
-    quote = "none of these is better than OL-AUX-5 as it is, and the smaller number in the logarithm is worse "
-    quote += f"({_p(tried['eps_0.001'], ours, budget)})"
-    yield Sentence(LAB, quote, ours.name, "better" not in verdicts.values() and verdicts["eps_0.001"] == "worse")
+    ours = {task: ol_aux.run(task, "ol_aux_5") for task in ol_aux.OPTION_BUDGETS}
+
+    def compare(task: str, option: str) -> tuple[str, str]:
+        tried, budget = ol_aux.options(task)[f"ol_aux_5_{option}"], ol_aux.OPTION_BUDGETS[task]
+        return c.verdict(tried, ours[task], budget), _p(tried, ours[task], budget)
+
+    verdicts = [
+        c.verdict(record, ours[task], budget)
+        for task, budget in ol_aux.OPTION_BUDGETS.items()
+        for record in ol_aux.options(task).values()
+    ]
+    quote = "None of these is better than OL-AUX-5 as it is."
+    yield Sentence(LAB, quote, ours[FETCH].name, "better" not in verdicts)
+    verdict, p = compare(FETCH, "eps_0.001")
+    yield Sentence(LAB, f"the smaller number in the logarithm is worse ({p})", ours[FETCH].name, verdict == "worse")
+    (first, p_100), (second, p_400), (third, p_maximum) = (
+        compare(HAND, option) for option in ("beta_100", "beta_400", "maximum_5")
+    )
+    quote = (
+        f"On the hand faster weights are worse, `beta_100` ({p_100}) as well as `beta_400` ({p_400}), and a maximum of 5 is "
+    )
+    quote += f"level ({p_maximum})"
+    yield Sentence(LAB, quote, ours[HAND].name, [first, second, third] == ["worse", "worse", "level"])
 
 
 def _weightings() -> Iterator[Sentence]:
@@ -109,9 +152,6 @@ def _weightings() -> Iterator[Sentence]:
     yield Sentence(
         LAB, f"level with none on FetchReach ({_p(run(FETCH, 'cosine'), none[FETCH], 240_000)})", run(FETCH, "cosine").name
     )
-    gated, without = (ol_aux.claim(FETCH, name) for name in ("cosine", "none"))
-    quote = f"as in the thesis, it is worse than none on FetchReach ({_p(gated, without, 240_000)})"
-    yield Sentence(LAB, quote, gated.name, c.verdict(gated, without, 240_000) == "worse")
     authors = c.authors(HAND, "none", 2_000_000)
     yield Sentence(
         LAB, f"{none[HAND].median(2_000_000):.3f} against {authors.median(2_000_000):.3f} at 2 M steps", none[HAND].name
@@ -371,6 +411,8 @@ def sentences() -> list[Sentence]:
         _weightings,
         _logarithm,
         _sum,
+        _fixed,
+        _cosine,
         _release,
         _ol_aux_options,
         _single_tasks,

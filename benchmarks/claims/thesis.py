@@ -224,10 +224,7 @@ def _balance_and_none() -> Claim:
 
 def _cosine() -> Claim:
     comparisons = _ol_aux("cosine", "none", ol_aux.BUDGETS)
-    note = "On Fetch the gate is that of the thesis; on hand and finger it also stops the head of a loss"
-    return _comparison_claim(
-        "Cosine similarity is better than none (figure 5.4)", comparisons, f"[5.4]({_LAB}#figure-54)", note=note
-    )
+    return _comparison_claim("Cosine similarity is better than none (figure 5.4)", comparisons, f"[5.4]({_LAB}#figure-54)")
 
 
 def _n_steps() -> Claim:
