@@ -60,11 +60,10 @@ def measure(settings: Settings) -> Iterator[Measurement]:
 
 
 def image_sizes(settings: Settings) -> tuple[int, ...]:
-    """Return the image sizes to measure: the defaults for this kind of device, or only a requested one not among them."""
-    sizes = ACCELERATOR_SIZES if settings.on_accelerator else CPU_SIZES
-    if settings.image_size is not None and settings.image_size not in sizes:
+    """Return the image sizes to measure: the requested one, or the defaults for this kind of device."""
+    if settings.image_size is not None:
         return (settings.image_size,)
-    return sizes
+    return ACCELERATOR_SIZES if settings.on_accelerator else CPU_SIZES
 
 
 def random_states(settings: Settings, count: int, seed: int = 4) -> Any:

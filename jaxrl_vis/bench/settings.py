@@ -13,7 +13,7 @@ from jaxrl_vis_envs import registry
 class Settings:
     """Settings of a benchmark.
 
-    If None or empty, ``image_size`` and ``pixels`` depend on the device, ``envs`` on the device and the benchmark, and
+    If None or empty, ``pixels`` depends on the device, ``image_size`` and ``envs`` on the device and the benchmark, and
     ``preset``, ``batch_size`` and ``data_devices`` are the defaults of the benchmark.
 
     Attributes:
@@ -50,12 +50,12 @@ class Settings:
     def for_this_device(self) -> Self:
         """Return a copy with the defaults that depend on the device alone; each benchmark fills in its own sizes."""
         accelerator = jax.default_backend() != "cpu"
-        return dataclasses.replace(
-            self,
-            image_size=self.image_size or (64 if accelerator else 32),
-            pixels=self.pixels or ("rgbd" if accelerator else "depth"),
-            on_accelerator=accelerator,
-        )
+        return dataclasses.replace(self, pixels=self.pixels or ("rgbd" if accelerator else "depth"), on_accelerator=accelerator)
+
+    @property
+    def size(self) -> int:
+        """Height and width of images: the requested one, or the default for this kind of device."""
+        return self.image_size or (64 if self.on_accelerator else 32)
 
     def batch_sizes(self, cpu: tuple[int, ...], accelerator: tuple[int, ...]) -> tuple[int, ...]:
         """Return the batch sizes to measure: the requested ones, or the defaults for this kind of device."""
@@ -72,7 +72,7 @@ class Settings:
         Raises:
             RequestError: The environment is unknown, or rejects the settings.
         """
-        images = dict(image_size=self.image_size, pixels=self.pixels) | overrides
+        images = dict(image_size=self.size, pixels=self.pixels) | overrides
         try:
             return registry.make(self.env, **(images if self.has_images else {}))
         except ValueError as error:
@@ -82,7 +82,7 @@ class Settings:
         """Return the entries of a record for the measured environment."""
         if not self.has_images:
             return {"env": self.env}
-        return dict(env=self.env, image_size=self.image_size, pixels=self.pixels)
+        return dict(env=self.env, image_size=self.size, pixels=self.pixels)
 
     def preset_config(self) -> dict[str, str]:
         """Return the entry of a record for the preset; empty for the default of the device."""

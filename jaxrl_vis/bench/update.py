@@ -21,7 +21,7 @@ from jaxrl_vis.types import LoopState, ReplayState
 def training_config(settings: Settings, **overrides: Any) -> Config:
     """Return the requested preset, or this device's, with the environment, images and sizes of the benchmark."""
     if settings.has_images:
-        overrides |= changes(image_size=settings.image_size, pixels=settings.pixels)
+        overrides |= changes(image_size=settings.size, pixels=settings.pixels)
     if settings.batch_size is not None:
         overrides["batch_size"] = settings.batch_size
     overrides |= changes(devices=settings.devices, data_devices=settings.data_devices, seeds=settings.seeds)

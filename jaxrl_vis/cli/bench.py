@@ -31,8 +31,8 @@ class Bench:
     """Batch sizes in environments (or images), one measurement each (not used by update). If not given: sizes suitable for the
     device; for train, the preset's."""
     image_size: int | None = None
-    """Height and width of images (not used by physics); 64 on accelerators and 32 on a CPU if not given. render measures 64
-    and 100, or 32 and 64, unless this is a different one."""
+    """Height and width of images (not used by physics). If not given: 64 on accelerators and 32 on a CPU; for render, 64 and
+    100, or 32 and 64."""
     pixels: Pixels | None = None
     """Channels of images (env, update, train); rgbd on accelerators and depth on a CPU if not given. render measures several
     instead."""

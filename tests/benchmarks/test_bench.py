@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import bench, cli
-from jaxrl_vis.bench import conditions, peaks, physics, record, roofline, timing, train, update, variation
+from jaxrl_vis.bench import conditions, peaks, physics, record, render, roofline, timing, train, update, variation
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.config import preset
@@ -334,6 +334,11 @@ def test_settings_of_images_go_to_environments_that_have_them() -> None:
     assert update.training_config(images).environment.image_size == 16
     with pytest.raises(RequestError, match="needs an environment with images, and Reacher has none"):
         bench.run("render", env="Reacher")
+
+
+@pytest.mark.parametrize(("requested", "sizes"), [(None, (32, 64)), (64, (64,)), (16, (16,))])
+def test_only_a_requested_image_size_is_measured(requested: int | None, sizes: tuple[int, ...]) -> None:
+    assert render.image_sizes(Settings(image_size=requested).for_this_device()) == sizes
 
 
 def test_a_missing_opengl_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

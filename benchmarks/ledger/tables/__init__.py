@@ -6,6 +6,7 @@ lab_rows     rows of lab_results             stalks       docs/phenotyping.md
 render       docs/lab/renderer_speed.md      weighting    docs/weighting.md
 contrastive  docs/algorithms.md              exported     docs/export.md
 pixels       docs/pixels.md                  host         docs/indicator_rewards.md
-push         docs/tasks.md                audit        docs/indicator_rewards.md
+push         docs/tasks.md               audit        docs/indicator_rewards.md
+factors      docs/lab/real_stalks.md
 render also writes docs/lab/meshes.md.
 """
