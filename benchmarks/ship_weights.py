@@ -11,6 +11,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.digests import file_digest
 from jaxrl_vis.stalks.grasping.masks import painter
 from jaxrl_vis.stalks.phenotyping.detector import weights
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 
 
 def main(trained: Path) -> None:
@@ -20,8 +21,10 @@ def main(trained: Path) -> None:
             params, settings, origin = room.read_weights(trained)
         except RequestError:
             continue
-        room.write_weights(room.SHIPPED, params, settings, origin, bits=10)
-        print(f"{room.SHIPPED}: {file_digest(room.SHIPPED)}, {room.SHIPPED.stat().st_size / 1e6:.1f} MB")
+        is_for_photographs = isinstance(settings, Settings) and settings.section
+        target = weights.PHOTOGRAPHS if is_for_photographs else room.SHIPPED
+        room.write_weights(target, params, settings, origin, bits=10)
+        print(f"{target}: {file_digest(target)}, {target.stat().st_size / 1e6:.1f} MB")
         return
     sys.exit(f"{trained} holds no weights of stalks")
 

@@ -1,5 +1,7 @@
 """Fit the gate of a weights file, and measure it: `python -m benchmarks.stalks.gate FOLDER --weights WEIGHTS`.
 
+That of the weights that ship for unknown cameras, `PHOTOGRAPHS`, is fitted on the same images as if their cameras were unknown.
+
 Images of several families are rendered into FOLDER unless they exist. The gate and its threshold are fitted on the images of
 the first seeds, and written beside the weights; the printed metrics come from other seeds. A control uses only mean brightness
 and sharpness of an image. Real images are never fitted on: `--photographs MODULE:FUNCTION` names a function that yields (image,
@@ -18,11 +20,11 @@ import numpy as np
 
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.host.worker_pool import evaluate_all, share_accelerator
-from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
+from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Finder, in_frame
 from jaxrl_vis.stalks.phenotyping.detector.gate import Gate, fit_gate, fit_logistic_regression, gate_path, write_gate
 from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder
 from jaxrl_vis.stalks.phenotyping.detector.sections import STALK
-from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
+from jaxrl_vis.stalks.phenotyping.detector.weights import PHOTOGRAPHS, SHIPPED
 from jaxrl_vis.stalks.phenotyping.measure.borders import fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.training.examples import true_boxes
 from jaxrl_vis.stalks.phenotyping.training.held_out import MIN_SCORE, match_to_annotations
@@ -94,8 +96,17 @@ def brightness_and_sharpness(image: np.ndarray) -> tuple[float, float]:
     return float(grey.mean()), float(np.log(cv2.Laplacian(grey, cv2.CV_64F).var() + 1e-3))
 
 
+def rows_of_boxes(stalks: np.ndarray) -> Band | None:
+    """Return the rows of the band in each column of an image, interpolated between true boxes [N, 6]; None without boxes."""
+    if not len(stalks):
+        return None
+    order = np.argsort(stalks[:, [0, 2]].mean(axis=1))
+    columns, tops, bottoms = stalks[order][:, [0, 2]].mean(axis=1), stalks[order, 1], stalks[order, 3]
+    return lambda column: (float(np.interp(column, columns, tops)), float(np.interp(column, columns, bottoms)))
+
+
 def detect_stalks(
-    finder: Finder, image: np.ndarray, pixels_per_metre: float | None
+    finder: Finder, image: np.ndarray, pixels_per_metre: float | None, band: Band | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Detect stalks in an image whose borders are filled.
 
@@ -103,13 +114,15 @@ def detect_stalks(
         finder: The detector.
         image: [H, W, 3] uint8.
         pixels_per_metre: Pixels per metre at the plants; None if unknown.
+        band: Rows to which networks that detect sections cut stalks; None if unknown.
 
     Returns:
         Detections [N, 6] in pixels of ``image``, their scores [N], and the pooled features [C].
     """
     frame = find_frame(image)
-    stalks, scores, pooled = finder.detect_boxes(fill_borders(image, frame), pixels_per_metre)
     over, down = frame.columns[0], frame.lines[0]
+    inside = None if band is None else in_frame(band, frame)
+    stalks, scores, pooled = finder.detect_boxes(fill_borders(image, frame), pixels_per_metre, inside)
     return stalks + np.array([over, down, over, down, over, over], np.float32), scores, pooled
 
 
@@ -118,18 +131,19 @@ def f1_score(hits: int, detections: int, stalks: int) -> float:
     return 2.0 * hits / (detections + stalks) if detections + stalks else 1.0
 
 
-def image_statistics(path: Path, finder: Finder, name: str) -> list[ImageStatistics]:
+def image_statistics(path: Path, finder: Finder, name: str, is_known: bool) -> list[ImageStatistics]:
     """Return the statistics of each image in a file of `render_plot`, from the cache beside it, which is written if missing.
 
     Args:
         path: The file.
         finder: The detector.
         name: Name of the detector, whose last word identifies the cache.
+        is_known: False to detect as if the camera were unknown.
     """
     cached = path.with_suffix(f".{name.split()[-1]}.npz")
     if not cached.exists():
         arrays = {}
-        for index, seen in enumerate(_detect_images(path, finder)):
+        for index, seen in enumerate(_detect_images(path, finder, is_known)):
             values = {"pooled": seen.pooled, "scores": seen.scores, "f1": seen.f1, "plain": seen.plain}
             arrays |= {f"{key}_{index}": value for key, value in values.items()}
         np.savez(cached, **arrays)
@@ -142,11 +156,12 @@ def image_statistics(path: Path, finder: Finder, name: str) -> list[ImageStatist
     ]
 
 
-def _detect_images(path: Path, finder: Finder) -> Iterator[ImageStatistics]:
+def _detect_images(path: Path, finder: Finder, is_known: bool) -> Iterator[ImageStatistics]:
     with np.load(path) as data:
         for index in range(FRAMES):
             image, truth, kinds = (data[f"{name}_{index}"] for name in ("image", "stalks", "kinds"))
-            stalks, scores, pooled = detect_stalks(finder, image, float(data["pixels_per_metre"]))
+            pixels_per_metre = float(data["pixels_per_metre"]) if is_known else None
+            stalks, scores, pooled = detect_stalks(finder, image, pixels_per_metre, rows_of_boxes(truth))
             right, ignored = match_to_annotations(stalks, scores, truth, kinds)
             counted = (scores >= MIN_SCORE) & ~ignored
             f1 = f1_score(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
@@ -248,7 +263,8 @@ def main() -> None:
     for part, family, number in tasks:
         path = options.folder / f"{part}_{family}_{number}.npz"
         if path.exists():
-            seen[part] += image_statistics(path, finder, detector_name(options.weights))
+            is_known = options.weights.resolve() != PHOTOGRAPHS
+            seen[part] += image_statistics(path, finder, detector_name(options.weights), is_known)
     fitted, tried = seen["fit"], seen["test"]
     wrong = np.array([image.f1 < MIN_F1 for image in fitted])
     pooled, plots = np.array([image.pooled for image in fitted]), np.arange(len(fitted)) // FRAMES

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis.stalks.phenotyping.detector.gate import fit_gate, gate_path, read_gate, write_gate
-from jaxrl_vis.stalks.phenotyping.pipeline import Request, _unfamiliar_note
+from jaxrl_vis.stalks.phenotyping.pipeline import _unfamiliar_note
 
 SURE, UNSURE = np.array([0.97, 0.95, 0.02]), np.array([0.6, 0.45, 0.3])
 
@@ -58,10 +58,12 @@ def test_a_gate_is_for_its_weights_alone(gate, images, tmp_path):
     assert read_gate(weights) is None
 
 
-def test_a_plot_is_flagged_where_most_of_its_pairs_are(tmp_path):
-    request = Request(tmp_path, "strip", "networks", {}, max_doubt=0.5)
-    told = _unfamiliar_note(request, [{"doubt": 0.9}, {"doubt": 0.7}, {"doubt": 0.1}])
+def test_a_plot_is_flagged_where_most_of_its_pairs_are():
+    def note(*doubts: float | None, max_doubt: float | None = 0.5) -> str:
+        return _unfamiliar_note([{"doubt": doubt, "max_doubt": max_doubt} for doubt in doubts])
+
+    told = note(0.9, 0.7, 0.1)
     assert told.startswith("2 of 3 pairs are unlike") and "0.70, the limit 0.50" in told
-    assert not _unfamiliar_note(request, [{"doubt": 0.9}, {"doubt": 0.1}])
-    assert not _unfamiliar_note(request, [{"doubt": None}, {}])
-    assert not _unfamiliar_note(Request(tmp_path, "strip", "truth", {}), [{"doubt": 0.9}])
+    assert not note(0.9, 0.1)
+    assert not _unfamiliar_note([{}])
+    assert not note(None, None, max_doubt=None)

@@ -15,6 +15,7 @@ from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, cover
 from jaxrl_vis.stalks.phenotyping.detector.detect import GRID, Settings, detect, init_detector, pool_regions
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, cut_to_band
+from jaxrl_vis.stalks.phenotyping.detector.loading import load_finder
 from jaxrl_vis.stalks.phenotyping.detector.sections import (
     ABSENT,
     NOTHING,
@@ -24,7 +25,7 @@ from jaxrl_vis.stalks.phenotyping.detector.sections import (
     section_anchors,
     true_sections,
 )
-from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights, write_weights
+from jaxrl_vis.stalks.phenotyping.detector.weights import PHOTOGRAPHS, SHIPPED, read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_lines
 from jaxrl_vis.stalks.phenotyping.training.augment import augment_geometry
 from jaxrl_vis.stalks.phenotyping.training.detector_training import OUTPUTS, start_sections
@@ -313,3 +314,14 @@ def test_weights_say_whether_they_detect_sections(tmp_path):
     inside, _, _ = finder.detect_boxes(image, every.pixels_per_metre, lambda column: (9.5, 49.5))
     assert len(anywhere) == len(scores) > 0 and len(inside) > 0
     assert set(anywhere[:, 1].tolist()) <= {0.0, 32.0} and (inside[:, [1, 3]] == [10.0, 50.0]).all()
+
+
+def test_shipped_networks_pass_images_of_unknown_cameras_to_those_for_photographs():
+    shipped, for_photographs = load_finder(SHIPPED, 0.0), load_finder(PHOTOGRAPHS, 0.0)
+    image = np.random.default_rng(0).integers(0, 256, (96, 128, 3), np.uint8)
+
+    def boxes(finder: Finder, *camera: float) -> list[tuple[float, float, float, float]]:
+        return [detection.box for detection in finder(image, *camera)]
+
+    assert boxes(shipped) == boxes(for_photographs) != []
+    assert boxes(shipped, 250.0) != boxes(for_photographs, 250.0)

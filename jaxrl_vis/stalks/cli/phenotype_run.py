@@ -88,7 +88,6 @@ def run(options: Run) -> int:
     from jaxrl_vis.stalks.phenotyping.measure.lens import VALIDATED
     from jaxrl_vis.stalks.phenotyping.pipeline import Request, run
 
-    gate = None
     if options.masks == "truth":
         from jaxrl_vis.stalks.phenotyping.evaluation.truth_on_disk import find_truth
 
@@ -97,17 +96,15 @@ def run(options: Run) -> int:
         from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, find_stalks, load_finder, resolve_weights
 
         weights = resolve_weights(options.weights)
-        gate = load_finder(weights, options.min_score).gate  # reports what is wrong with the weights
         name = f"{detector_name(weights)}, least score {options.min_score:g}"
-        if gate is None:
+        if load_finder(weights, options.min_score).gate is None:  # reports what is wrong with the weights
             print(
                 "these weights have no gate: nothing tells whether your images are like those that they know", file=sys.stderr
             )
         find = functools.partial(find_stalks, weights, options.min_score)
 
     tried = VALIDATED if options.masks == "network" else None
-    max_doubt = None if gate is None else gate.threshold
-    request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale, tried, max_doubt)
+    request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale, tried)
     for plot in plots:
         if calibrations[plot.name] is None:
             print(f"{plot.name}: no calibration, so no millimetres and no count: name one with --calibration", file=sys.stderr)

@@ -105,13 +105,14 @@ def _start(options: DetectorTraining, is_daytime: bool) -> tuple[Any, "Settings"
     For daytime plots, networks detect sections: nothing in an image of an unknown camera shows where the band is.
     """
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
-    from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
+    from jaxrl_vis.stalks.phenotyping.detector.weights import PHOTOGRAPHS, SHIPPED, read_weights
     from jaxrl_vis.stalks.phenotyping.training.detector_training import start_sections
 
     start = options.start or "random"
     if start == "random":
         return None, Settings().for_sections() if is_daytime else Settings(), ""
-    params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
+    shipped = PHOTOGRAPHS if is_daytime else SHIPPED
+    params, settings, _ = read_weights(shipped if start == "shipped" else Path(start))
     if is_daytime and not settings.section:
         params, settings = start_sections(params, settings, options.seed)
         print(f"{start}: {BAND_WEIGHTS}", flush=True)

@@ -165,7 +165,7 @@ def _start(options: DetectorTraining, folder: Path, echo: Any) -> tuple[Any, Set
         RequestError: Weights given by ``--start`` are for stalks of a very different size.
     """
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
-    from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
+    from jaxrl_vis.stalks.phenotyping.detector.weights import PHOTOGRAPHS, SHIPPED, read_weights
     from jaxrl_vis.stalks.phenotyping.io.calibration import find_calibration
     from jaxrl_vis.stalks.phenotyping.training.annotated import fit_settings
     from jaxrl_vis.stalks.phenotyping.training.detector_training import start_sections
@@ -175,7 +175,8 @@ def _start(options: DetectorTraining, folder: Path, echo: Any) -> tuple[Any, Set
     if start == "random":
         settings = Settings() if calibrated else Settings().for_sections()
         return None, fit_settings(folder, settings, options.label), ""
-    params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
+    shipped = SHIPPED if calibrated else PHOTOGRAPHS
+    params, settings, _ = read_weights(shipped if start == "shipped" else Path(start))
     origin = f", from {'the weights that ship' if start == 'shipped' else start}"
     if not calibrated and not settings.section:
         params, settings = start_sections(params, settings, options.seed)

@@ -74,7 +74,6 @@ class Request:
         speed: Speed of the robot, m/s, for odometry with times only; None if unknown.
         disparity_scale: Divisor of disparities in integer images, such as PNG of 16 bits.
         lens_range: Range of lenses on which the detector was validated; None to accept any.
-        max_doubt: Doubt of the gate above which an image is reported as unfamiliar; None if there is no gate.
     """
 
     out: Path
@@ -84,7 +83,6 @@ class Request:
     speed: float | None = None
     disparity_scale: float = 256.0
     lens_range: LensRange | None = None
-    max_doubt: float | None = None
 
 
 def run(
@@ -262,12 +260,13 @@ def _make_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles
         wrong = pair_fault(view.detections, view.sightings, left, right, calibration, view.ground)
     if wrong is not None:
         return {"skipped": wrong}
-    doubt = view.detections.doubt if isinstance(view.detections, Detections) else None
+    seen = view.detections if isinstance(view.detections, Detections) else Detections()
     return {
         "size": list(left.shape[:2]),
         "lines": list(view.frame.lines),
         "columns": list(view.frame.columns),
-        "doubt": None if doubt is None else round(doubt, 4),
+        "doubt": None if seen.doubt is None else round(seen.doubt, 4),
+        "max_doubt": seen.max_doubt,
         "camera_height_m": None if view.ground is None else round(view.ground.camera_height, 4),
         "sightings": [sighting.json_values() for sighting in view.sightings],
     }
@@ -309,7 +308,7 @@ def _finish_plot(
         labels = sighting_labels(frames, tracks)
         start = float(path.positions[0])
         stalks, row = plot_rows(frames, tracks, path, skipped, origin)
-    strange = _unfamiliar_note(request, [record for _, record in usable])
+    strange = _unfamiliar_note([record for _, record in usable])
     if strange:
         row = {**row, "flag": UNFAMILIAR if row["flag"] == "ok" else f"{row['flag']}; {UNFAMILIAR}"}
     _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, run_all)
@@ -318,17 +317,16 @@ def _finish_plot(
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width, why, strange)
 
 
-def _unfamiliar_note(request: Request, records: list[dict[str, Any]]) -> str:
+def _unfamiliar_note(records: list[dict[str, Any]]) -> str:
     """Return a warning if more than half of the pairs of a plot are unfamiliar to the networks; else an empty string."""
-    doubts = [record["doubt"] for record in records if record.get("doubt") is not None]
-    if request.max_doubt is None or not doubts:
+    judged = [(record["doubt"], record["max_doubt"]) for record in records if record.get("max_doubt") is not None]
+    unlike = sum(doubt > limit for doubt, limit in judged)
+    if unlike <= len(judged) / 2:
         return ""
-    unlike = sum(doubt > request.max_doubt for doubt in doubts)
-    if unlike <= len(doubts) / 2:
-        return ""
+    doubt, limit = np.median(judged, axis=0)
     return (
-        f"{unlike} of {len(doubts)} pairs are unlike the images that the networks read rightly (the median of their doubts is "
-        f"{np.median(doubts):.2f}, the limit {request.max_doubt:.2f}): look at the overlays before you trust a number"
+        f"{unlike} of {len(judged)} pairs are unlike the images that the networks read rightly (the median of their doubts is "
+        f"{doubt:.2f}, the limit {limit:.2f}): look at the overlays before you trust a number"
     )
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import jax
@@ -62,11 +62,14 @@ class Detections(list[Detection]):
     Args:
         detections: Detected stalks.
         doubt: Estimated probability that the image is misread, see `Gate.doubt`; None if unknown.
+        max_doubt: Doubt above which the image counts as unfamiliar; None if unknown.
     """
 
-    def __init__(self, detections: Iterable[Detection] = (), doubt: float | None = None) -> None:
+    def __init__(
+        self, detections: Iterable[Detection] = (), doubt: float | None = None, max_doubt: float | None = None
+    ) -> None:
         super().__init__(detections)
-        self.doubt = doubt
+        self.doubt, self.max_doubt = doubt, max_doubt
 
 
 UPPER_OFFSET = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
@@ -166,14 +169,23 @@ class Finder:
         settings: Settings stored with the weights.
         min_score: Minimum score of a detection; 0.5 balances misses against false detections.
         gate: Gate that estimates how likely each image is misread; None if there is none for these weights.
+        for_unknown: Detector that replaces this one for images of unknown cameras; None for this one.
 
     Attributes:
         dtype: Compute dtype of the convolutions.
         gate: Gate as passed to the constructor.
     """
 
-    def __init__(self, params: Any, settings: Settings, min_score: float = 0.5, gate: Gate | None = None) -> None:
+    def __init__(
+        self,
+        params: Any,
+        settings: Settings,
+        min_score: float = 0.5,
+        gate: Gate | None = None,
+        for_unknown: Self | None = None,
+    ) -> None:
         self._params, self._settings, self._min_score, self.gate = params, settings, min_score, gate
+        self._for_unknown = for_unknown
         accelerated = jax.default_backend() in ("gpu", "tpu")
         self.dtype = jnp.bfloat16 if accelerated else jnp.float32
         self._batch = _BATCH_ON_ACCELERATOR if accelerated else _BATCH
@@ -187,10 +199,13 @@ class Finder:
             band: Rows of the band; None if the camera is unknown. Without it, networks that detect sections return the part of
                 each stalk with the highest scores.
         """
+        if pixels_per_metre is None and self._for_unknown is not None:
+            return self._for_unknown(image, None, band)
         frame = find_frame(image)
         detections = self._find(fill_borders(image, frame), pixels_per_metre, frame, band)
         ordered = sorted(detections, key=lambda detection: sum(detection.axis))
-        return Detections((_to_full_image(detection, frame) for detection in ordered), doubt=detections.doubt)
+        in_full_image = (_to_full_image(detection, frame) for detection in ordered)
+        return Detections(in_full_image, detections.doubt, None if self.gate is None else self.gate.threshold)
 
     def detect_boxes(
         self, image: np.ndarray, pixels_per_metre: float | None, band: Band | None = None
@@ -226,7 +241,7 @@ class Finder:
         """
         settings = self._settings
         relative_scale = settings.width / settings.full_width / settings.scale_for(image.shape[1], pixels_per_metre)
-        stalks, scores, pooled = self.detect_boxes(image, pixels_per_metre, None if band is None else _in_frame(band, frame))
+        stalks, scores, pooled = self.detect_boxes(image, pixels_per_metre, None if band is None else in_frame(band, frame))
         doubt = None if self.gate is None else self.gate.doubt(pooled, scores)
         selected = scores >= self._min_score
         stalks, scores = stalks[selected], scores[selected]
@@ -298,7 +313,7 @@ def cut_to_band(chains: list[Chain], scale: tuple[float, float], band: Band | No
     return to_image_coordinates(np.array(stalks, np.float32).reshape(-1, 6), scale), np.array(scores, np.float32)
 
 
-def _in_frame(band: Band, frame: Frame) -> Band:
+def in_frame(band: Band, frame: Frame) -> Band:
     """Convert the rows of the band from coordinates of the whole image to those of a frame."""
     down, over = frame.lines[0], frame.columns[0]
 

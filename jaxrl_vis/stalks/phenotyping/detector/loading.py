@@ -10,7 +10,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.digests import file_digest
 from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection, Finder
 from jaxrl_vis.stalks.phenotyping.detector.gate import read_gate
-from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
+from jaxrl_vis.stalks.phenotyping.detector.weights import PHOTOGRAPHS, SHIPPED, read_weights
 
 
 def resolve_weights(weights: Path | None) -> Path:
@@ -29,18 +29,22 @@ def resolve_weights(weights: Path | None) -> Path:
 
 
 def detector_name(weights: Path) -> str:
-    """Return a name of the networks that is derived from the contents of the weights file."""
-    return f"networks {file_digest(weights)}"
+    """Return a name of the networks that is derived from the contents of the weights file, or of both that ship."""
+    files = (SHIPPED, PHOTOGRAPHS) if weights == SHIPPED else (weights,)
+    return f"networks {'+'.join(map(file_digest, files))}"
 
 
 @functools.cache
 def _load(weights: Path, digest: str, min_score: float) -> Finder:
     params, settings, _ = read_weights(weights)
-    return Finder(params, settings, min_score, read_gate(weights))
+    for_unknown = load_finder(PHOTOGRAPHS, min_score) if weights == SHIPPED else None
+    return Finder(params, settings, min_score, read_gate(weights), for_unknown)
 
 
 def load_finder(weights: Path, min_score: float) -> Finder:
     """Load the networks; cached by the path and contents of the file within a process.
+
+    With `SHIPPED`, images of unknown cameras are passed to the networks in `PHOTOGRAPHS`.
 
     Args:
         weights: Weights file.
