@@ -15,6 +15,7 @@ from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, cover
 from jaxrl_vis.stalks.phenotyping.detector.detect import GRID, Settings, detect, init_detector, pool_regions
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, cut_to_band
+from jaxrl_vis.stalks.phenotyping.detector.gate import read_gate
 from jaxrl_vis.stalks.phenotyping.detector.loading import load_finder
 from jaxrl_vis.stalks.phenotyping.detector.sections import (
     ABSENT,
@@ -316,12 +317,12 @@ def test_weights_say_whether_they_detect_sections(tmp_path):
     assert set(anywhere[:, 1].tolist()) <= {0.0, 32.0} and (inside[:, [1, 3]] == [10.0, 50.0]).all()
 
 
-def test_shipped_networks_pass_images_of_unknown_cameras_to_those_for_photographs():
-    shipped, for_photographs = load_finder(SHIPPED, 0.0), load_finder(PHOTOGRAPHS, 0.0)
+@pytest.mark.parametrize(("threshold", "camera", "is_replaced"), [(2.0, None, True), (2.0, 250.0, False), (-1.0, 250.0, True)])
+def test_images_of_unknown_cameras_and_unfamiliar_ones_are_read_by_other_networks(threshold, camera, is_replaced):
+    by_day, gate = load_finder(PHOTOGRAPHS, 0.0), read_gate(SHIPPED)
+    assert gate is not None and load_finder(SHIPPED, 0.0)._substitute is by_day
+    judged = dataclasses.replace(gate, threshold=threshold)
+    finder = Finder(*read_weights(SHIPPED)[:2], 0.0, judged, by_day)
     image = np.random.default_rng(0).integers(0, 256, (96, 128, 3), np.uint8)
-
-    def boxes(finder: Finder, *camera: float) -> list[tuple[float, float, float, float]]:
-        return [detection.box for detection in finder(image, *camera)]
-
-    assert boxes(shipped) == boxes(for_photographs) != []
-    assert boxes(shipped, 250.0) != boxes(for_photographs, 250.0)
+    boxes, others = ([detection.box for detection in find(image, camera)] for find in (finder, by_day))
+    assert others and (boxes == others) == is_replaced

@@ -71,6 +71,11 @@ class Detections(list[Detection]):
         super().__init__(detections)
         self.doubt, self.max_doubt = doubt, max_doubt
 
+    @property
+    def is_unfamiliar(self) -> bool:
+        """True if the gate finds the image unfamiliar."""
+        return self.doubt is not None and self.max_doubt is not None and self.doubt > self.max_doubt
+
 
 UPPER_OFFSET = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
 """Distance from the middle of the band up to the upper height, as a multiple of the height of the band."""
@@ -169,7 +174,7 @@ class Finder:
         settings: Settings stored with the weights.
         min_score: Minimum score of a detection; 0.5 balances misses against false detections.
         gate: Gate that estimates how likely each image is misread; None if there is none for these weights.
-        for_unknown: Detector that replaces this one for images of unknown cameras; None for this one.
+        substitute: Detector for images of unknown cameras, and for those that the gate finds unfamiliar; None for this one.
 
     Attributes:
         dtype: Compute dtype of the convolutions.
@@ -182,10 +187,10 @@ class Finder:
         settings: Settings,
         min_score: float = 0.5,
         gate: Gate | None = None,
-        for_unknown: Self | None = None,
+        substitute: Self | None = None,
     ) -> None:
         self._params, self._settings, self._min_score, self.gate = params, settings, min_score, gate
-        self._for_unknown = for_unknown
+        self._substitute = substitute
         accelerated = jax.default_backend() in ("gpu", "tpu")
         self.dtype = jnp.bfloat16 if accelerated else jnp.float32
         self._batch = _BATCH_ON_ACCELERATOR if accelerated else _BATCH
@@ -199,13 +204,15 @@ class Finder:
             band: Rows of the band; None if the camera is unknown. Without it, networks that detect sections return the part of
                 each stalk with the highest scores.
         """
-        if pixels_per_metre is None and self._for_unknown is not None:
-            return self._for_unknown(image, None, band)
+        if pixels_per_metre is None and self._substitute is not None:
+            return self._substitute(image, None, band)
         frame = find_frame(image)
         detections = self._find(fill_borders(image, frame), pixels_per_metre, frame, band)
+        if self._substitute is not None and detections.is_unfamiliar:
+            return self._substitute(image, pixels_per_metre, band)
         ordered = sorted(detections, key=lambda detection: sum(detection.axis))
         in_full_image = (_to_full_image(detection, frame) for detection in ordered)
-        return Detections(in_full_image, detections.doubt, None if self.gate is None else self.gate.threshold)
+        return Detections(in_full_image, detections.doubt, detections.max_doubt)
 
     def detect_boxes(
         self, image: np.ndarray, pixels_per_metre: float | None, band: Band | None = None
@@ -258,7 +265,7 @@ class Finder:
         some = np.array([higher[place] for place in shown], np.float32).reshape(-1, 6)
         above = self._placed_masks(on_device, some, settings.crop_height // 2, relative_scale)
         upper = {place: (_clear_border_rows(mask, corner, frame), corner) for place, (mask, corner) in zip(shown, above)}
-        detections = Detections(doubt=doubt)
+        detections = Detections(doubt=doubt, max_doubt=None if self.gate is None else self.gate.threshold)
         for place, (stalk, score, (mask, corner)) in enumerate(zip(stalks, scores, pieces)):
             if mask.size:
                 left, top, right, bottom, above, below = (float(edge) - 0.5 for edge in stalk)

@@ -37,14 +37,15 @@ def detector_name(weights: Path) -> str:
 @functools.cache
 def _load(weights: Path, digest: str, min_score: float) -> Finder:
     params, settings, _ = read_weights(weights)
-    for_unknown = load_finder(PHOTOGRAPHS, min_score) if weights == SHIPPED else None
-    return Finder(params, settings, min_score, read_gate(weights), for_unknown)
+    substitute = load_finder(PHOTOGRAPHS, min_score) if weights == SHIPPED else None
+    return Finder(params, settings, min_score, read_gate(weights), substitute)
 
 
 def load_finder(weights: Path, min_score: float) -> Finder:
     """Load the networks; cached by the path and contents of the file within a process.
 
-    With `SHIPPED`, images of unknown cameras are passed to the networks in `PHOTOGRAPHS`.
+    With `SHIPPED`, images of unknown cameras, and those that its gate finds unfamiliar, are read by the networks in
+    `PHOTOGRAPHS`.
 
     Args:
         weights: Weights file.

@@ -16,9 +16,10 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, init_detector
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 
 SHIPPED = Path(__file__).with_name("stalks.safetensors")
-"""Path of the shipped weights for calibrated cameras, trained on synthetic rows at night."""
+"""Path of the shipped weights for calibrated cameras at night, trained on synthetic rows lit by a flash."""
 PHOTOGRAPHS = Path(__file__).with_name("photographs.safetensors")
-"""Path of the shipped weights for unknown cameras, trained on synthetic plants by day and at night; they detect sections."""
+"""Path of the shipped weights for unknown cameras and for plants by day, trained on synthetic plants by day and at night; they
+detect sections."""
 SCHEMA = 2
 """File format version, increased when parameters change their meaning: since 2, box offsets are relative to the axis of
 the proposal."""
