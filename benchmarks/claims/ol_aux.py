@@ -191,7 +191,7 @@ def _main() -> str:
 
 def options(task: str) -> dict[str, Record]:
     """Return the kept runs of OL-AUX-5's options on a task, with the tuning seeds, by variant."""
-    return {variant: run(task, variant) for variant in OPTIONS if _is_kept(task, variant)}
+    return {variant: run(task, variant) for variant in (*OPTIONS, "ol_aux_5_adam") if _is_kept(task, variant)}
 
 
 def _options(task: str) -> str:

@@ -34,6 +34,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "ol_aux_5_eps_0.001": changes(weighting_eps=0.001),
     "ol_aux_5_heads": changes(weighting_heads="always"),
     "ol_aux_5_maximum_5": changes(weighting_maximum=5.0),
+    "ol_aux_5_total_5": changes(weighting_total=5.0),
 }
 """Options of OL-AUX-5 that were tried, by variant."""
 
