@@ -25,7 +25,7 @@ from jaxrl_vis.learner.algorithm import Algorithm, Batches, Setup
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.ddpg import adam, diagnostics, network_gradients
 from jaxrl_vis.learner.ddpg.learned_reward import LearnedReward, make_learned_reward
-from jaxrl_vis.learner.ddpg.network_gradients import PreparedBatch
+from jaxrl_vis.learner.ddpg.network_gradients import ComputeGradients, PreparedBatch
 from jaxrl_vis.learner.ddpg.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.networks.networks import BatchScaling, Networks
 from jaxrl_vis.learner.networks.policy import PolicyParams, make_policy
@@ -211,7 +211,12 @@ def _value_at_goals(networks: Networks, agent: Agent, statistics: Statistics, go
 
 
 def make_ddpg(
-    networks: Networks, config: Config, resolved: Resolved, auxiliary: Auxiliary | None = None, shards: Shards = ONE
+    networks: Networks,
+    config: Config,
+    resolved: Resolved,
+    auxiliary: Auxiliary | None = None,
+    shards: Shards = ONE,
+    compute: ComputeGradients | None = None,
 ) -> GradientSteps:
     """Build the gradient steps of DDPG for these networks.
 
@@ -221,12 +226,14 @@ def make_ddpg(
         resolved: Discount, bounds of the targets, filter threshold.
         auxiliary: Auxiliary tasks; None for those of ``config``, without stacked images.
         shards: Shards of the learner: batches are those of one shard, gradients and metrics those of the whole.
+        compute: See `build`.
     """
     if auxiliary is None:
         auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)
     learned_reward = make_learned_reward(networks, config, resolved)
     learning = Objectives(networks, config, resolved, auxiliary, shards)
     keeps_state, of_states = auxiliary.weighting.name != "none", bool(networks.critic_state_size)
+    compute = compute or (network_gradients.critic_of_states if of_states else network_gradients.critic_of_images)
 
     def prepare(working: WorkingState, batch: Batch) -> PreparedBatch:
         image = None
@@ -247,7 +254,6 @@ def make_ddpg(
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None
         state = auxiliary.start(copies.actor if of_states else copies.critic) if agent.weighting is None else agent.weighting
-        compute = network_gradients.critic_of_states if of_states else network_gradients.critic_of_images
         computed = compute(learning, copies, prepared._replace(batch=batch), state, with_actor)
         metrics, mean_square = computed.metrics, None if computed.action is None else jnp.mean(jnp.square(computed.action))
         counts = diagnostics.count_rewards(
@@ -342,18 +348,21 @@ def make(setup: Setup) -> Algorithm:
     return build(setup)
 
 
-def build(setup: Setup, critic_heads: int = 1, draw_noise: DrawNoise | None = None) -> Algorithm:
+def build(
+    setup: Setup, critic_heads: int = 1, draw_noise: DrawNoise | None = None, compute: ComputeGradients | None = None
+) -> Algorithm:
     """Build an algorithm of DDPG's family.
 
     Args:
         setup: Configuration and sizes.
         critic_heads: Number of critic heads; all share one target, from the minimum of their values (`Networks.critic_heads`).
         draw_noise: Sampler of the noise on actions in targets; None for no noise.
+        compute: Function that computes both networks' gradients; None for that of `network_gradients`.
     """
     config, resolved = setup.config, setup.resolved
     sizes = setup.action_size, resolved.critic_output_bias, critic_heads, setup.critic_state_size
     networks = Networks(config, setup.observation_spec, *sizes)
-    steps = make_ddpg(networks, config, resolved, setup.auxiliary, setup.shards)
+    steps = make_ddpg(networks, config, resolved, setup.auxiliary, setup.shards, compute)
     policy = make_policy(networks)
 
     def policy_params(agent: Agent, statistics: Statistics) -> PolicyParams:

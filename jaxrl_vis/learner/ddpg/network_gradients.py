@@ -4,7 +4,8 @@ critic_of_images    the critic's loss and auxiliary losses are weighted; the act
 critic_of_states    the critic encodes nothing; the actor's loss and auxiliary losses are weighted
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +52,10 @@ class NetworkGradients(NamedTuple):
     metrics: Metrics
 
 
+ComputeGradients = Callable[[Objectives, ComputeCopies, PreparedBatch, Any, bool], NetworkGradients]
+"""Function with the arguments of `critic_of_images`; the state of the weighting is whatever the algorithm's ``init`` made."""
+
+
 def critic_of_images(
     objectives: Objectives, copies: ComputeCopies, prepared: PreparedBatch, state: WeightingState, with_actor: bool
 ) -> NetworkGradients:
@@ -66,7 +71,7 @@ def critic_of_images(
     batch, inputs, image, noise = prepared
     weighted = objectives.critic_gradient(copies, inputs, image, batch, noise)(copies.critic, state)
     latents, value, keep = weighted.extra
-    metrics = {"train/critic_loss": weighted.losses[MAIN], "train/value": jnp.mean(value), **_weighting_metrics(weighted)}
+    metrics = {"train/critic_loss": weighted.losses[MAIN], "train/value": jnp.mean(value), **weighting_metrics(weighted)}
     if not with_actor:
         return NetworkGradients(weighted.gradient, None, weighted.state, keep, None, metrics)
     (metrics["train/actor_loss"], action), actor = jax.value_and_grad(objectives.actor_loss, has_aux=True)(
@@ -86,12 +91,12 @@ def critic_of_states(
     metrics = {"train/critic_loss": loss, "train/value": jnp.mean(value)}
     if not with_actor:
         return NetworkGradients(_float32(critic), None, state, keep, None, metrics)
-    weighted = objectives.actor_gradient(copies.critic, inputs, image, batch)(copies.actor, state)
-    metrics |= {"train/actor_loss": weighted.losses[MAIN], **_weighting_metrics(weighted)}
+    weighted = objectives.actor_gradient(copies.critic, inputs.states_t, inputs, image, batch)(copies.actor, state)
+    metrics |= {"train/actor_loss": weighted.losses[MAIN], **weighting_metrics(weighted)}
     return NetworkGradients(_float32(critic), weighted.gradient, weighted.state, keep, weighted.extra, metrics)
 
 
-def _weighting_metrics(weighted: Weighted) -> Metrics:
+def weighting_metrics(weighted: Weighted) -> Metrics:
     """Return the metrics of the weighting, and the auxiliary losses."""
     return {
         **{f"train/{name}": number for name, number in weighted.metrics.items()},

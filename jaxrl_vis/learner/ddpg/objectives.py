@@ -199,18 +199,23 @@ class Objectives:
         return main, (value, keep)
 
     def actor_gradient(
-        self, critic: Params, inputs: Inputs, image: jax.Array | None, batch: Batch
+        self, critic: Params, critic_inputs: jax.Array, inputs: Inputs, image: jax.Array | None, batch: Batch
     ) -> Callable[[Params, WeightingState], Weighted]:
-        """Build the function that computes the losses and the gradient of an actor whose critic observes true states.
+        """Build the function that computes the losses of an actor, and their gradient with weights of its own.
 
         ``extra`` are the actions [B, A]. The main loss is that of `actor_loss`; for a logarithm, it is raised by the maximum
-        value, so that it is positive. Arguments as for `critic_gradient`; the parameters ``critic`` are held constant.
+        value, so that it is positive.
+
+        Args:
+            critic: Parameters of the critic, which are held constant.
+            critic_inputs: True states, or latents of the critic's encoder (`Networks.values`).
+            inputs, image, batch: As in `critic_gradient`.
         """
 
         def actor_losses(actor: Params, encoded: Latents | dict[str, jax.Array]):
             latents = _collect_latents(self.auxiliary, encoded)
             action = self.networks.act(actor, latents.pair)
-            value = self.networks.value(critic, inputs.states_t, action)
+            value = self.networks.value(critic, critic_inputs, action)
             main = losses.actor_loss(value, action, self.config.ddpg.action_penalty)
             if self.auxiliary.weighting.log:
                 main = main + self._maximum_value
