@@ -244,6 +244,17 @@ def p_value_against(reference: Record, label: str, budget: int | None = None) ->
     return Column(f"p against {label}", cell)
 
 
+def seconds() -> Column:
+    """Return the column of wall-clock seconds, summed over the programs that trained the seeds, without compilation."""
+
+    def cell(record: Record) -> str:
+        # Seeds of one program have the same times.
+        last = {row["seed"]: (row["time/wall_s"], row["time/compile_s"]) for row in record.rows}
+        return f"{sum(wall - compilation for wall, compilation in set(last.values())):,.0f}"
+
+    return Column("seconds without compilation", cell)
+
+
 def training_precision() -> Column:
     """Return the column of the fraction of dropped negatives that were false over training; empty for an inactive filter."""
 

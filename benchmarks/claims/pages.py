@@ -5,7 +5,7 @@ import difflib
 import functools
 from collections.abc import Iterator
 
-from benchmarks.claims import ablations, indicator, ol_aux, thesis, weightings
+from benchmarks.claims import ablations, contrastive_view, goals, indicator, ol_aux, thesis, weightings
 from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT
 
@@ -14,7 +14,7 @@ from benchmarks.ledger.records import CHECKOUT
 def tables() -> dict[str, dict[str, str]]:
     """Compute all tables: page (path below the root) -> name in its markers -> text."""
     pages: dict[str, dict[str, str]] = collections.defaultdict(dict)
-    for module in (ol_aux, indicator, ablations, thesis, weightings):
+    for module in (ol_aux, indicator, ablations, thesis, weightings, goals, contrastive_view):
         for page, texts in module.tables().items():
             pages[page] |= texts
     return dict(pages)

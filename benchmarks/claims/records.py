@@ -14,6 +14,7 @@ from benchmarks.ledger.ablations import read_curves
 from benchmarks.ledger.records import RESULTS
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.run.storage.folder import read_record
+from jaxrl_vis.studies.engine.study import Family
 
 SUCCESS, DISTANCE = "eval/success", "eval/goal_distance"
 FIRST_FRESH_SEED = 100  # seeds below are used for tuning
@@ -147,6 +148,22 @@ def study(family: str, stem: str, is_fresh: bool = False, budget: int = 0) -> Re
     if not folders:
         raise LookupError(f"no run {stem} with seeds is kept in {RESULTS / 'studies' / family}")
     return _merge_records(f"studies/{family}/{stem}", (_read_run(folder) for _, folder in sorted(folders.items())))
+
+
+def variants(family: Family, task: str) -> dict[str, Record]:
+    """Return the runs of a family on a task by variant, in the family's order, with fresh seeds if there are any."""
+    records = {}
+    for variant in family.variants:
+        try:
+            records[variant] = study(family.name, f"{task}-{variant}-{family.preset}", is_fresh=True)
+        except LookupError:
+            continue
+    return records
+
+
+def runs(folder: str) -> dict[str, Record]:
+    """Return the runs in a folder of benchmarks/results by name; {} if there are none."""
+    return {path.name: _read_run(path) for path in (RESULTS / folder).glob("*") if path.is_dir()}
 
 
 def fresh_variants(task: str) -> list[str]:
