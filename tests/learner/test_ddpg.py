@@ -285,7 +285,7 @@ def test_saved_encoders_are_not_there(options):
 def test_policy_learns_from_images_with_fewer_encoders():
     """The policy reaches the goals of goal images; an actor that steps half as often needs longer."""
     settings = {"encoder_filters": (8, 8), "relabel_probability": 0.9, "normalizer_floor": 1.0}
-    program, train, _ = trained(probes.SeenGoWhereTold(), iterations=20, batch_size=32, **settings, **CHEAPER["all"])
+    program, train, _ = trained(probes.SeenGoWhereTold(), iterations=30, batch_size=32, **settings, **CHEAPER["all"])
     outcome, _ = program.evaluate(jax.tree.map(lambda leaf: leaf[None], train), jax.random.key(11))
     assert outcome["eval/success"][0] >= 0.9
 

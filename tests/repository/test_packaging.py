@@ -309,7 +309,7 @@ def test_wheel_is_small(wheel: Path) -> None:
     sizes = {
         file.filename: file.compress_size for file in zipfile.ZipFile(wheel).infolist() if "/pretrained/" not in file.filename
     }
-    assert sum(size for name, size in sizes.items() if not name.endswith(".py")) <= 4_900_000
+    assert sum(size for name, size in sizes.items() if not name.endswith(".py")) <= 7_300_000
     assert sum(size for name, size in sizes.items() if name.endswith(".py")) <= 1_200_000
     assert max(file.file_size for file in zipfile.ZipFile(wheel).infolist()) <= 5_000_000
 
