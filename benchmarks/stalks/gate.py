@@ -121,7 +121,7 @@ def detect_stalks(
         Detections [N, 6] in pixels of ``image``, their scores [N], and the pooled features [C].
     """
     frame = find_frame(image)
-    over, down = frame.columns[0], frame.lines[0]
+    over, down = frame.columns[0], frame.rows[0]
     inside = None if band is None else in_frame(band, frame)
     stalks, scores, pooled = finder.detect_boxes(fill_borders(image, frame), pixels_per_metre, inside)
     return stalks + np.array([over, down, over, down, over, over], np.float32), scores, pooled

@@ -45,8 +45,8 @@ def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]
             if measurement.diameter_mm is None:
                 break
             heights = np.linspace(0.0, 0.6, 1201)
-            lines = outline(stalk, pair.pose, drive.true, heights)[:, :, 1].mean(axis=1)
-            height = float(heights[np.argmin(np.abs(lines - measurement.line))])
+            image_rows = outline(stalk, pair.pose, drive.true, heights)[:, :, 1].mean(axis=1)
+            height = float(heights[np.argmin(np.abs(image_rows - measurement.row))])
             # Near a node, the true diameter is the mean of those above and below it.
             offsets = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
             true = 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in offsets]))

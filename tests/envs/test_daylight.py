@@ -88,9 +88,9 @@ def test_boxes_of_turned_and_rolled_cameras_hold_the_stalks(bare):
     assert len(clear) > 5 and np.median([stalk.visible for stalk in clear]) > 0.8
     for stalk in clear:
         left, top, right, bottom = stalk.box
-        line, column = np.nonzero(instance == stalk.stalk)
+        row, column = np.nonzero(instance == stalk.stalk)
         assert left - 1.5 <= column.min() and column.max() <= right + 1.5
-        assert top - 1.5 <= line.min() and line.max() <= bottom + 1.5
+        assert top - 1.5 <= row.min() and row.max() <= bottom + 1.5
     assert image[np.isinf(depth)].mean() > 10  # the sky is not black
 
 
@@ -167,10 +167,10 @@ def test_a_blade_stands_where_it_projects_in_the_colour_of_its_ground():
     for baseline in (0.0, 0.1):
         camera = (np.array([baseline, 0.0, 0.0]), np.eye(3), 500.0, (100.0, 150.0))
         changed = render_blades(radiance, ground, depth, one_blade(), camera) != radiance
-        line, column = np.nonzero(changed.any(axis=2))
-        assert (line.min(), line.max()) == (200, 250)
+        row, column = np.nonzero(changed.any(axis=2))
+        assert (row.min(), row.max()) == (200, 250)
         assert np.median(column) == 100 - 500 * baseline / 2
-        assert abs(np.ptp(column[line == 250]) - 5) <= 1 and np.ptp(column[line == 205]) <= 2
+        assert abs(np.ptp(column[row == 250]) - 5) <= 1 and np.ptp(column[row == 205]) <= 2
     covered = render_blades(radiance, ground, depth, one_blade(), camera)
     np.testing.assert_allclose(covered[240, 75], [0.3, 0.2, 0.1], rtol=1e-5)
 
@@ -180,8 +180,8 @@ def test_a_blade_is_hidden_by_what_is_nearer():
     depth[:230] = 1.5
     instance = np.where(depth < 2, 7, GROUND).astype(np.int32)
     covered = render_blades(radiance, instance, depth, one_blade(), (np.zeros(3), np.eye(3), 500.0, (100.0, 150.0)))
-    line, _ = np.nonzero((covered != radiance).any(axis=2))
-    assert (line.min(), line.max()) == (230, 250)
+    row, _ = np.nonzero((covered != radiance).any(axis=2))
+    assert (row.min(), row.max()) == (230, 250)
 
 
 def test_blades_grow_on_grass_by_day_only():

@@ -207,10 +207,10 @@ def test_disparity_times_depth_is_focal_length_times_baseline(sequence, pair):
     assert (disparity[~seen] == 0).all()
 
 
-def crossings(points: np.ndarray, line: float) -> float:
-    """Return the column at which an edge [K, 2] crosses a line."""
+def crossings(points: np.ndarray, row: float) -> float:
+    """Return the column at which an edge [K, 2] crosses a row."""
     order = np.argsort(points[:, 1])
-    return float(np.interp(line, points[order, 1], points[order, 0]))
+    return float(np.interp(row, points[order, 1], points[order, 0]))
 
 
 def test_mask_edges_match_the_true_diameter(sequence, pair):
@@ -218,9 +218,9 @@ def test_mask_edges_match_the_true_diameter(sequence, pair):
     instance, checked = np.asarray(pair.instance), []
     for index, stalk in enumerate(sequence.plot.measured):
         edges = outline(stalk, pair.pose, sequence.drive.true, np.linspace(0.0, 1.3, 500))
-        for line in range(10, 130, 5):
-            left, right = (crossings(edges[:, side], line) for side in (0, 1))
-            columns = np.flatnonzero(instance[line] == index)
+        for row in range(10, 130, 5):
+            left, right = (crossings(edges[:, side], row) for side in (0, 1))
+            columns = np.flatnonzero(instance[row] == index)
             # Where something stands before it, its mask ends earlier.
             if columns.size and left > 1 and right < WIDTH - 2 and abs(columns.size - (right - left)) < 1.5:
                 checked.append((columns[0] - 0.5 - left, columns[-1] + 0.5 - right))
@@ -249,10 +249,10 @@ def test_boxes_are_tight_and_visibility_is_a_fraction(sequence, pair):
     found = stalks_in_view(sequence.plot, pair.pose, sequence.drive.true, instance, depth)
     assert len(found) >= 4
     for stalk in found:
-        line, column = np.nonzero(instance == stalk.stalk)
-        assert stalk.pixels == line.size
+        row, column = np.nonzero(instance == stalk.stalk)
+        assert stalk.pixels == row.size
         if stalk.visible_box is not None:
-            assert stalk.visible_box == (column.min() - 0.5, line.min() - 0.5, column.max() + 0.5, line.max() + 0.5)
+            assert stalk.visible_box == (column.min() - 0.5, row.min() - 0.5, column.max() + 0.5, row.max() + 0.5)
             # What is seen is inside of what is there, but for half a pixel.
             bounds = np.array(stalk.box) + np.array([-1.0, -1.0, 1.0, 1.0])
             assert (np.array(stalk.visible_box)[:2] >= bounds[:2]).all() and (
@@ -273,9 +273,9 @@ def test_a_stalk_keeps_its_identity_over_frames(sequence, pair):
     after = np.asarray(following.instance)
     agree = total = 0
     for index in range(len(sequence.plot.measured)):
-        line, column = np.nonzero(instance == index)
-        x, y = (column - true.centre[0]) / true.focal, (line - true.centre[1]) / true.focal
-        camera = np.stack([x, y, np.ones_like(x)], axis=1) * depth[line, column][:, None]
+        row, column = np.nonzero(instance == index)
+        x, y = (column - true.centre[0]) / true.focal, (row - true.centre[1]) / true.focal
+        camera = np.stack([x, y, np.ones_like(x)], axis=1) * depth[row, column][:, None]
         moved = following.pose.to_camera(pair.pose.to_world(camera))
         places = np.round(moved[:, :2] / moved[:, 2:] * true.focal + np.array(true.centre)).astype(int)
         inside = (places >= 1).all(axis=1) & (places < np.array([WIDTH, 169]) - 1).all(axis=1)
@@ -287,11 +287,11 @@ def test_a_stalk_keeps_its_identity_over_frames(sequence, pair):
 
 
 def test_the_ground_is_flat_and_visible(sequence, pair):
-    line, column = np.nonzero(np.asarray(pair.instance) == -2)
+    row, column = np.nonzero(np.asarray(pair.instance) == -2)
     true = sequence.drive.true
-    x, y = (column - true.centre[0]) / true.focal, (line - true.centre[1]) / true.focal
-    points = np.stack([x, y, np.ones_like(x)], axis=1) * np.asarray(pair.depth)[line, column][:, None]
-    assert line.size > 1000
+    x, y = (column - true.centre[0]) / true.focal, (row - true.centre[1]) / true.focal
+    points = np.stack([x, y, np.ones_like(x)], axis=1) * np.asarray(pair.depth)[row, column][:, None]
+    assert row.size > 1000
     assert np.abs(pair.pose.to_world(points)[:, 2]).max() < 1e-4
 
 
@@ -398,15 +398,15 @@ def test_a_pair_gives_diameters_in_millimetres(close_up):
             to_grey_floats(np.asarray(pair.right)),
         )
         for index, stalk in enumerate(close_up.plot.measured):
-            line, column = np.nonzero(instance == index)
-            if line.size < 1000 or column.min() < 175 or column.max() > 400:
+            row, column = np.nonzero(instance == index)
+            if row.size < 1000 or column.min() < 175 or column.max() > 400:
                 continue  # the right camera does not see it, or neither sees all of it
-            corner = (int(line.min()), int(column.min()) - 2)
-            mask = instance[corner[0] : line.max() + 1, corner[1] : column.max() + 3] == index
+            corner = (int(row.min()), int(column.min()) - 2)
+            mask = instance[corner[0] : row.max() + 1, corner[1] : column.max() + 3] == index
             found = measure_stalk(mask, corner, left, right, drive.true)
             assert not found.reason, found.reason
-            lines = outline(stalk, pair.pose, drive.true, np.linspace(0.1, 0.6, 501))[:, :, 1].mean(axis=1)
-            height = float(np.linspace(0.1, 0.6, 501)[np.argmin(np.abs(lines - found.line))])
+            rows = outline(stalk, pair.pose, drive.true, np.linspace(0.1, 0.6, 501))[:, :, 1].mean(axis=1)
+            height = float(np.linspace(0.1, 0.6, 501)[np.argmin(np.abs(rows - found.row))])
             assert found.depth == pytest.approx(-pair.pose.position[1] + stalk.at_height(height)[0][1], abs=0.02)
             if found.confidence > 0.6 and stalk.node_distance(height) > 0.01:
                 errors.append(found.diameter_mm - 1e3 * stalk.diameter(height))

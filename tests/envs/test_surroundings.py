@@ -86,9 +86,9 @@ def test_a_panel_is_where_it_projects():
     picture = np.concatenate([np.full((4, 4, 3), 0.4, np.float32), np.ones((4, 4, 1), np.float32)], axis=2)
     board = Panel(np.array([-0.5, 0.0, 1.0]), np.array([1.0, 0, 0]), np.array([0, 0, 0.5]), picture)
     radiance, instance, depth = render_panels(scene(5.0), [board], CAMERA, LIGHT)
-    line, column = np.nonzero(instance == LITTER)
-    assert (line.min(), line.max()) == (16, 40) and (column.min(), column.max()) == (25, 74)
-    np.testing.assert_allclose(depth[line, column], 2.0, rtol=1e-5)
+    row, column = np.nonzero(instance == LITTER)
+    assert (row.min(), row.max()) == (16, 40) and (column.min(), column.max()) == (25, 74)
+    np.testing.assert_allclose(depth[row, column], 2.0, rtol=1e-5)
     np.testing.assert_allclose(radiance[30, 50], 0.4 * (0.5 + 0.75), rtol=1e-5)
     assert (instance[50:] == 7).all() and (radiance[50:] == 0).all()
     hidden = render_panels(scene(1.5), [board], CAMERA, LIGHT)
@@ -152,6 +152,6 @@ def test_truth_of_an_upright_image_is_where_the_stalk_is():
     sequence, (_, instance, _) = rendered()
     heights = np.linspace(0.2, 0.6 * sequence.plot.stalks[0].points[-1, 2], 60)
     edges = outline(sequence.plot.stalks[0], sequence.drive.poses[17], sequence.drive.true, heights)
-    column, line = np.round(edges.mean(axis=1)).astype(int).T
-    inside = (line >= 0) & (line < instance.shape[0]) & (column >= 0) & (column < instance.shape[1])
-    assert inside.sum() > 10 and (instance[line[inside], column[inside]] == 0).mean() > 0.3
+    column, row = np.round(edges.mean(axis=1)).astype(int).T
+    inside = (row >= 0) & (row < instance.shape[0]) & (column >= 0) & (column < instance.shape[1])
+    assert inside.sum() > 10 and (instance[row[inside], column[inside]] == 0).mean() > 0.3

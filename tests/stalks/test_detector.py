@@ -66,8 +66,8 @@ def test_roi_align_is_torchvisions(aligned):
 
 def test_a_region_leans_as_its_stalk():
     """In features that hold their coordinates, each row of the grid is shifted by the lean of its box."""
-    lines, columns = jnp.meshgrid(jnp.arange(40.0), jnp.arange(60.0), indexing="ij")
-    features = jnp.stack([lines, columns], axis=-1)
+    rows, columns = jnp.meshgrid(jnp.arange(40.0), jnp.arange(60.0), indexing="ij")
+    features = jnp.stack([rows, columns], axis=-1)
     boxes, lean = jnp.array([[20.0, 10.0, 28.0, 30.0], [30.0, 4.0, 38.0, 24.0]]), jnp.array([10.0, -5.0])
     upright = np.asarray(roi_align(features, boxes, (5, 4), 1.0, 2, True))
     leaning = np.asarray(roi_align(features, boxes, (5, 4), 1.0, 2, True, lean))
@@ -104,8 +104,8 @@ def test_a_stalk_that_two_finds_outline_is_one():
 
     upright, crossing = image.copy(), image.copy()
     upright[:, 40:60] = 0.9
-    for line in range(120):
-        crossing[line, line // 2 + 10 : line // 2 + 30] = 0.9
+    for row in range(120):
+        crossing[row, row // 2 + 10 : row // 2 + 30] = 0.9
     upright[crossing > 0.5] = 0.2  # it is behind the other one
     part = crossing[20:120, 30:100]
     half = np.where(np.arange(120)[:, None] < 55, crossing, upright)  # the first of one and the rest of the other
@@ -171,12 +171,12 @@ def test_a_crop_is_put_back_where_it_was():
     image = rng.uniform(0.1, 1, (60, 50)).astype(np.float32)
     stalk = np.array([18.0, 5, 40, 55, 36, 20], np.float32)
     crop = np.asarray(cut_crops(jnp.asarray(image), stalk[None], (48, 16)))[0]
-    back, (line, column) = paste_crop(crop, stalk, image.shape)
-    there = image[line : line + back.shape[0], column : column + back.shape[1]]
+    back, (row, column) = paste_crop(crop, stalk, image.shape)
+    there = image[row : row + back.shape[0], column : column + back.shape[1]]
     assert (back > 0).sum() == 48 * 16
     np.testing.assert_array_equal(back[back > 0], there[back > 0])
     # The stalk stands upright in the middle: its axis is the crop's middle column.
-    middle = 36 + (20 - 36) * (line + 0.5 - 5) / 50
+    middle = 36 + (20 - 36) * (row + 0.5 - 5) / 50
     assert np.flatnonzero(back[0])[[0, -1]].mean() + column + 0.5 == pytest.approx(middle, abs=0.6)
 
 
@@ -205,11 +205,11 @@ def drawing(seed: int) -> Example:
     image = rng.integers(0, 40, (60, 64, 3)).astype(np.uint8)
     top, bottom = rng.uniform(20, 44, 2)
     mask = np.zeros((60, 64), bool)
-    for line in range(60):
-        middle = top + (bottom - top) * (line - 15) / 30
+    for row in range(60):
+        middle = top + (bottom - top) * (row - 15) / 30
         begin, end = np.clip([round(middle - 3), round(middle + 3)], 0, 64)
-        image[line, begin:end] = 200
-        mask[line, begin:end] = True
+        image[row, begin:end] = 200
+        mask[row, begin:end] = True
     stalk = np.array([min(top, bottom) - 3, 15, max(top, bottom) + 3, 45, top, bottom], np.float32)
     stalks, kinds = np.zeros((MAX_STALKS, 6), np.float32), np.zeros(MAX_STALKS, np.int32)
     stalks[0], kinds[0] = stalk, STALK
@@ -234,10 +234,10 @@ def test_stalks_move_with_their_images():
     assert moved.dtype == jnp.uint8
     compared = 0
     for image, stalk, kind, width in zip(np.asarray(moved), np.asarray(places)[:, 0], np.asarray(kinds)[:, 0], sizes[:, 1]):
-        for line in range(int(np.ceil(stalk[1])), int(stalk[3]), 5):
-            bright = np.flatnonzero(image[line, :, 0] > 120)
+        for row in range(int(np.ceil(stalk[1])), int(stalk[3]), 5):
+            bright = np.flatnonzero(image[row, :, 0] > 120)
             if kind == STALK and bright.size and bright[0] > 0 and bright[-1] < width - 1:
-                middle = stalk[4] + (stalk[5] - stalk[4]) * (line + 0.5 - stalk[1]) / (stalk[3] - stalk[1])
+                middle = stalk[4] + (stalk[5] - stalk[4]) * (row + 0.5 - stalk[1]) / (stalk[3] - stalk[1])
                 assert bright.mean() + 0.5 == pytest.approx(middle, abs=1.2)
                 assert stalk[0] - 1.2 <= bright[0] and bright[-1] + 1 <= stalk[2] + 1.2
                 compared += 1
@@ -294,8 +294,8 @@ def test_networks_learn_to_find_and_outline(trained, tmp_path):
         best = max(found, key=lambda each: each.score)
         box = np.array(best.box)[None] + 0.5
         overlaps.append(float(box_iou(jnp.asarray(box), jnp.asarray(example.stalks[:1, :4]))[0, 0]))
-        (line, column), (tall, wide) = best.corner, best.mask.shape
-        bright = example.image[line : line + tall, column : column + wide, 0] > 120
+        (row, column), (tall, wide) = best.corner, best.mask.shape
+        bright = example.image[row : row + tall, column : column + wide, 0] > 120
         agreement.append(((best.mask > 0.5) & bright).sum() / ((best.mask > 0.5) | bright).sum())
     assert np.median(overlaps) > 0.5
     assert np.median(agreement) > 0.5

@@ -62,16 +62,16 @@ def test_images_are_resized_by_the_focal_length_and_not_by_their_width():
 
 
 @pytest.mark.parametrize(
-    ("lines", "kept", "added"), [(676, 676, 0), (620, 620, 0), (740, 740, 0), (1127, 676, -226), (407, 676, 134)]
+    ("height", "kept", "added"), [(676, 676, 0), (620, 620, 0), (740, 740, 0), (1127, 676, -226), (407, 676, 134)]
 )
-def test_images_of_other_views_get_the_lines_that_networks_know(lines, kept, added):
+def test_images_of_other_views_get_the_rows_that_networks_know(height, kept, added):
     """A wide lens's image is cropped to its middle rows; a long lens's image gets black rows above and below."""
-    image = np.repeat(np.arange(1, lines + 1)[:, None, None], 40, axis=1) * np.ones(3, int)
+    image = np.repeat(np.arange(1, height + 1)[:, None, None], 40, axis=1) * np.ones(3, int)
     usual, above = pad_to_training_height(image, Settings())
     assert usual.shape == (kept, 40, 3) and above == added
     middle = usual[kept // 2, 0, 0]
-    assert abs(middle - (lines // 2 + 1)) <= 1
-    shown = usual[max(above, 0) : kept - max(kept - lines - above, 0), 0, 0]
+    assert abs(middle - (height // 2 + 1)) <= 1
+    shown = usual[max(above, 0) : kept - max(kept - height - above, 0), 0, 0]
     np.testing.assert_array_equal(np.diff(shown), 1)  # nothing is left out or twice
 
 
@@ -204,8 +204,8 @@ def scene(kind: str) -> tuple[np.ndarray, np.ndarray]:
     """Return a noisy image [240, 320, 3] uint8 with black wedges and a bar around it, and their mask [240, 320]."""
     rng = np.random.default_rng(1)
     image = cv2.GaussianBlur(rng.integers(30, 255, (240, 320, 3)).astype(np.float32), (0, 0), 2.0).astype(np.uint8)
-    line, column = np.mgrid[:240, :320]
-    outside = (column < 40 - 0.2 * line) | (column > 310 - 0.05 * line) | (line < 8)
+    row, column = np.mgrid[:240, :320]
+    outside = (column < 40 - 0.2 * row) | (column > 310 - 0.05 * row) | (row < 8)
     image[outside] = 0
     if kind == "jpeg":
         image = cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 92])[1], cv2.IMREAD_COLOR)
@@ -216,14 +216,14 @@ def scene(kind: str) -> tuple[np.ndarray, np.ndarray]:
 def test_borders_are_found_and_filled(kind):
     image, outside = scene(kind)
     frame = find_frame(image)
-    assert abs(frame.lines[0] - 8) <= 2 and frame.lines[1] == 240 and frame.shown is not None
+    assert abs(frame.rows[0] - 8) <= 2 and frame.rows[1] == 240 and frame.shown is not None
     assert not (frame.shown & outside).mean() > 0.004  # nothing of a border is shown
     assert (~frame.shown & ~outside).mean() < 0.03  # and little is lost beside it
     filled = fill_borders(image, frame)
     assert filled.shape[1] == frame.columns[1] - frame.columns[0]
     assert (filled.max(axis=-1) <= 12).mean() < 0.002  # at the tips of wedges
-    inside = frame.shown[slice(*frame.lines), slice(*frame.columns)]
-    np.testing.assert_array_equal(filled[inside], image[slice(*frame.lines), slice(*frame.columns)][inside])
+    inside = frame.shown[slice(*frame.rows), slice(*frame.columns)]
+    np.testing.assert_array_equal(filled[inside], image[slice(*frame.rows), slice(*frame.columns)][inside])
 
 
 def test_dark_scenes_have_no_borders():

@@ -173,9 +173,9 @@ def seen(
         for angle in np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61):
             front = middle + radius[:, None] * [math.sin(angle), -math.cos(angle), 0.0]
             camera = pose.to_camera(front)
-            column, line = np.round(camera[:, :2] / camera[:, 2:] * CAMERA.focal + CAMERA.centre).astype(int).T
-            inside = (column >= 0) & (column < 320) & (line >= 0) & (line < 320)
-            depth[line[inside], column[inside]] = camera[inside, 2]
+            column, row = np.round(camera[:, :2] / camera[:, 2:] * CAMERA.focal + CAMERA.centre).astype(int).T
+            inside = (column >= 0) & (column < 320) & (row >= 0) & (row < 320)
+            depth[row[inside], column[inside]] = camera[inside, 2]
     red = np.isfinite(depth)
     background = np.where(red, depth, np.float32(0.9))
     return build_cloud(CAMERA.disparity(background).astype(np.float32), red, CAMERA, MOUNT)

@@ -24,8 +24,8 @@ SIZE = (120, 100)
 def leaning() -> tuple[Detection, np.ndarray]:
     """Return a detection of a leaning strip 9 pixels wide, whose crop extends beyond its box, and its mask within the box."""
     mask = np.zeros(SIZE, bool)
-    for line in range(SIZE[0]):
-        mask[line, 40 + line // 5 : 49 + line // 5] = True
+    for row in range(SIZE[0]):
+        mask[row, 40 + row // 5 : 49 + row // 5] = True
     part = mask[5:115, 30:90].astype(np.float32)
     shown = np.zeros(SIZE, bool)
     shown[20:100] = mask[20:100]
@@ -35,7 +35,7 @@ def leaning() -> tuple[Detection, np.ndarray]:
 def test_outlines_enclose_the_pixels_of_masks(leaning):
     found, mask = leaning
     corners = outline(found)
-    assert len(corners) < 80  # not one for each line
+    assert len(corners) < 80  # not one for each row
     drawn = rasterize_polygons([corners], SIZE)
     assert (drawn & mask).sum() / (drawn | mask).sum() > 0.94
     assert abs(int(drawn.sum()) - int(mask.sum())) < 0.02 * mask.sum()

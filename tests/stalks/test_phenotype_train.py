@@ -107,7 +107,7 @@ def test_outlines_teach_masks(folder, weights, tmp_path):
 
 
 def test_boxes_of_another_size_start_from_random_weights_or_are_refused(folder, tmp_path, capsys):
-    # A calibration says how large the stalks are: 30 lines, where the shipped weights have 135.
+    # A calibration says how large the stalks are: 30 rows, where the shipped weights have 135.
     calibrated = tmp_path / "calibrated"
     shutil.copytree(folder, calibrated)
     pixels_per_metre = read_weights(SHIPPED)[1].pixels_per_metre
@@ -280,7 +280,7 @@ def test_masks_of_outlines_agree_with_boxes_and_runs(tmp_path):
     settings = dataclasses.replace(TINY, width=100, full_width=100, crop_height=192, crop_width=32)
     (of_rectangle,) = annotated_examples(tmp_path, settings)
     mask = of_rectangle.masks[0]
-    assert mask.any(axis=1).sum() == 170 and set(mask.sum(axis=1)) == {0, 14}  # lines of a crop may be shifted
+    assert mask.any(axis=1).sum() == 170 and set(mask.sum(axis=1)) == {0, 14}  # rows of a crop may be shifted
     data = {"images": [{"id": 1, "file_name": "row.png", "width": 100, "height": 200}]}
     for segmentation in (None, encode_mask(np.ones((170, 14), bool), (20, 30), size)):
         data["annotations"] = [{"image_id": 1, "bbox": [30, 20, 14, 170], "segmentation": segmentation}]

@@ -61,12 +61,12 @@ def test_leaves_and_nodes_do_not_change_a_strip():
     clean = fit_strip(mask)
     disturbed = mask.copy()
     half = mask.shape[0] // 2
-    for line in range(half - 60, half - 20):  # a leaf before its right half
-        columns = np.flatnonzero(mask[line])
-        disturbed[line, columns[len(columns) // 2 :]] = False
-    for line in range(half + 30, half + 45):  # a node, 10 % thicker
-        columns = np.flatnonzero(mask[line])
-        disturbed[line, columns[0] - 2 : columns[0]] = disturbed[line, columns[-1] + 1 : columns[-1] + 3] = True
+    for row in range(half - 60, half - 20):  # a leaf before its right half
+        columns = np.flatnonzero(mask[row])
+        disturbed[row, columns[len(columns) // 2 :]] = False
+    for row in range(half + 30, half + 45):  # a node, 10 % thicker
+        columns = np.flatnonzero(mask[row])
+        disturbed[row, columns[0] - 2 : columns[0]] = disturbed[row, columns[-1] + 1 : columns[-1] + 3] = True
     found = fit_strip(disturbed)
     assert found.width() == pytest.approx(30.0, abs=0.2)
     assert found.lean == pytest.approx(np.radians(7.0), abs=0.003)
@@ -76,9 +76,9 @@ def test_leaves_and_nodes_do_not_change_a_strip():
 
 def test_a_sheath_elsewhere_does_not_matter_where_a_width_is_taken():
     """A sheath adds 1.5 pixels on either side in rows 120 to 240; from row 330 on, a leaf occludes one edge."""
-    line = np.arange(400)[:, None]
-    half = np.where((line >= 120) & (line < 240), 21.5, 20.0)
-    mask = np.abs(np.arange(120)[None, :] - 60.3 - 0.05 * line) < half
+    row = np.arange(400)[:, None]
+    half = np.where((row >= 120) & (row < 240), 21.5, 20.0)
+    mask = np.abs(np.arange(120)[None, :] - 60.3 - 0.05 * row) < half
     mask[330:] &= np.arange(120) < 75
     strip = fit_strip(mask)
     across = np.cos(strip.lean)
@@ -130,8 +130,8 @@ def test_a_width_that_was_not_seen_where_it_is_asked_for_is_a_lower_bound():
     mask[:130, 38:60] = False
     image, known = np.full((400, 240), 90.0, np.float32), np.full((400, 240), 125.0, np.float32)
 
-    def measured(line: float):
-        return measure_stalk(mask, (20, 80), image, image, cameras, line=line, disparity=known)
+    def measured(row: float):
+        return measure_stalk(mask, (20, 80), image, image, cameras, row=row, disparity=known)
 
     seen, hidden = measured(300.0), measured(90.0)
     assert seen.both_edges_visible and seen.width == pytest.approx(40.0, abs=0.1)
@@ -139,9 +139,9 @@ def test_a_width_that_was_not_seen_where_it_is_asked_for_is_a_lower_bound():
 
 
 def test_taper_is_followed():
-    line = np.arange(300)[:, None]
-    half = 20.0 - 0.02 * line
-    mask = np.abs(np.arange(120)[None, :] - 60.3 - 0.05 * line) < half
+    row = np.arange(300)[:, None]
+    half = 20.0 - 0.02 * row
+    mask = np.abs(np.arange(120)[None, :] - 60.3 - 0.05 * row) < half
     strip = fit_strip(mask)
     for where in (50, 150, 250):
         expected = 2 * (20.0 - 0.02 * where) * np.cos(strip.lean)
@@ -184,9 +184,9 @@ def test_tilt_is_read_from_the_slope_of_disparity():
     """The stalk leans away by 10 degrees, and is seen at two heights."""
     depth = 0.8
     higher = np.array([0.0, -0.1, depth + 0.1 * np.tan(np.radians(10.0))])
-    lines = 0.0, higher[1] / higher[2] * CAMERAS.focal
+    rows = 0.0, higher[1] / higher[2] * CAMERAS.focal
     disparities = CAMERAS.disparity(np.array([depth, higher[2]]))
-    slope = (disparities[1] - disparities[0]) / (lines[1] - lines[0])
+    slope = (disparities[1] - disparities[0]) / (rows[1] - rows[0])
     assert tilt_from_disparity(slope, disparities.mean(), CAMERAS) == pytest.approx(np.radians(10.0), rel=0.03)
 
 
@@ -202,13 +202,13 @@ def over_ground(height: float | None, pitch: float = 0.0) -> tuple[np.ndarray, n
     left = cv2.GaussianBlur(rng.uniform(0, 255, (480, 640)).astype(np.float32), (0, 0), 1.0)
     right = np.empty_like(left)
     columns = np.arange(640)
-    for line in range(480):
+    for row in range(480):
         wall = CAMERAS.focal * CAMERAS.baseline / 1.0
-        down = (line - CAMERAS.centre[1]) / CAMERAS.focal
+        down = (row - CAMERAS.centre[1]) / CAMERAS.focal
         # A ray (0, down, 1) meets the ground where its height, height - Z (down cos + sin), is 0.
         inverse = 0.0 if height is None else (down * np.cos(pitch) + np.sin(pitch)) / height
         disparity = max(wall, CAMERAS.focal * CAMERAS.baseline * inverse)
-        right[line] = np.interp(columns + disparity, columns, left[line])
+        right[row] = np.interp(columns + disparity, columns, left[row])
     return left, right
 
 
@@ -219,8 +219,8 @@ def test_the_ground_is_found_and_heights_count_from_it(height, pitch):
     # A point 0.1 m above the ground, 0.7 m ahead of the camera's foot.
     drop = height - 0.1
     y, z = drop * np.cos(pitch) - 0.7 * np.sin(pitch), drop * np.sin(pitch) + 0.7 * np.cos(pitch)
-    line = y / z * CAMERAS.focal + CAMERAS.centre[1]
-    assert ground.height(400.0, line, z, CAMERAS) == pytest.approx(0.1, abs=0.01)
+    row = y / z * CAMERAS.focal + CAMERAS.centre[1]
+    assert ground.height(400.0, row, z, CAMERAS) == pytest.approx(0.1, abs=0.01)
 
 
 def test_no_ground_is_invented():
@@ -266,15 +266,15 @@ def shifted_pair() -> tuple[np.ndarray, np.ndarray, float]:
 
 def test_disparities_are_found_to_a_fraction_of_a_pixel(shifted_pair):
     left, right, true = shifted_pair
-    lines = np.arange(20, 220, 10)
-    edges = np.full(lines.size, 200.0), np.full(lines.size, 229.0)
-    found = match_rows(left, right, lines, edges, (40.0, 80.0))
+    rows = np.arange(20, 220, 10)
+    edges = np.full(rows.size, 200.0), np.full(rows.size, 229.0)
+    found = match_rows(left, right, rows, edges, (40.0, 80.0))
     assert found.values.size > 15
     value, error = found.at(120.0)
     assert value == pytest.approx(true, abs=0.1) and error < 0.1
     # Nothing is made up where there is nothing to match.
-    assert match_rows(left, right, lines, (edges[0] - 120, edges[1] - 120), (10.0, 40.0)).at(120.0) is None
-    assert match_rows(left, np.zeros_like(right), lines, edges, (40.0, 80.0)).values.size == 0
+    assert match_rows(left, right, rows, (edges[0] - 120, edges[1] - 120), (10.0, 40.0)).at(120.0) is None
+    assert match_rows(left, np.zeros_like(right), rows, edges, (40.0, 80.0)).values.size == 0
 
 
 def test_semi_global_matching_agrees(shifted_pair):
@@ -338,7 +338,7 @@ def test_what_opencv_cannot_read_is_not_an_image(tmp_path, monkeypatch):
 
 def test_disparities_are_read_in_every_convention(tmp_path):
     expected = np.array([[1.5, np.nan, 200.25], [3.0, 4.0, np.nan]], np.float32)
-    header = b"Pf\n3 2\n-1.0\n"  # little-endian, last line first
+    header = b"Pf\n3 2\n-1.0\n"  # little-endian, last row first
     (tmp_path / "a.pfm").write_bytes(header + np.nan_to_num(expected, nan=np.inf)[::-1].astype("<f4").tobytes())
     write_image(tmp_path / "b.png", (np.nan_to_num(expected) * 256).astype(np.uint16))
     write_image(tmp_path / "c.tiff", (np.nan_to_num(expected) * 64).astype(np.uint16))

@@ -64,10 +64,10 @@ def write(
             "yuv422": pixels,
         }
         values["mono16"] = pixels[..., 0].astype(np.uint16) * 200
-        lines = np.ascontiguousarray(values[encoding]).view(np.uint8).reshape(SIZE[0], -1)
-        lines = np.pad(lines, ((0, 0), (0, 5)))  # rows may be longer than their pixels
-        about = {"height": SIZE[0], "width": SIZE[1], "encoding": encoding, "is_bigendian": 0, "step": lines.shape[1]}
-        return types["sensor_msgs/msg/Image"](header=header(nanoseconds), **about, data=lines.ravel())
+        rows = np.ascontiguousarray(values[encoding]).view(np.uint8).reshape(SIZE[0], -1)
+        rows = np.pad(rows, ((0, 0), (0, 5)))  # rows may be longer than their pixels
+        about = {"height": SIZE[0], "width": SIZE[1], "encoding": encoding, "is_bigendian": 0, "step": rows.shape[1]}
+        return types["sensor_msgs/msg/Image"](header=header(nanoseconds), **about, data=rows.ravel())
 
     def camera(shift: float):
         region = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)

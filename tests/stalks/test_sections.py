@@ -27,7 +27,7 @@ from jaxrl_vis.stalks.phenotyping.detector.sections import (
     true_sections,
 )
 from jaxrl_vis.stalks.phenotyping.detector.weights import PHOTOGRAPHS, SHIPPED, read_weights, write_weights
-from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_lines
+from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_rows
 from jaxrl_vis.stalks.phenotyping.training.augment import augment_geometry
 from jaxrl_vis.stalks.phenotyping.training.detector_training import OUTPUTS, start_sections
 from jaxrl_vis.stalks.phenotyping.training.edges import _sides, annotated_edges, stack_edges, synthetic_edges
@@ -116,9 +116,9 @@ def test_edges_move_with_the_image():
     checked = 0
     for picture, stalks in zip(moved, after[:, :2]):
         for row, (left, right, visible) in ((row, each) for edges in stalks for row, each in enumerate(edges)):
-            lines = picture[8 * row + 3 : 8 * row + 5].max(axis=0)
+            values = picture[8 * row + 3 : 8 * row + 5].max(axis=0)
             if visible == 1.0 and left > 5 and right < WIDTH - 5:
-                assert lines[int(left + 2)] > 150 and lines[int(right - 3)] > 150
+                assert values[int(left + 2)] > 150 and values[int(right - 3)] > 150
                 checked += 1
     assert checked > 150
     gone = after[:, :2, :, 2] < 0  # rows that come from outside the image
@@ -223,9 +223,9 @@ def test_the_band_is_where_the_ground_says():
     camera = Calibration(844, 676, 542.0, (421.5, 337.5), 0.1)
     ground = Ground((0.1, 2.2, 0.3))
     for height, column in ((0.2, 100.0), (0.4, 700.0)):
-        line = ground.line(column, height, 0.8, camera)
-        assert ground.height(column, line, 0.8, camera) == pytest.approx(height)
-    top, bottom = band_lines(None, camera, 0.8, 300.0)
+        row = ground.row(column, height, 0.8, camera)
+        assert ground.height(column, row, 0.8, camera) == pytest.approx(height)
+    top, bottom = band_rows(None, camera, 0.8, 300.0)
     assert bottom - top == pytest.approx(0.2 * 542 / 0.8) and top == pytest.approx(337.5 + (0.42 - 0.4048) * 542 / 0.8)
     chain = Chain(chain_of(*[100.0] * 12), np.full(11, 0.9))
     stalks, scores = cut_to_band([chain], (2.0, 2.0), lambda column: (99.5, 199.5) if column == 199.5 else (0.0, 0.0))
@@ -265,10 +265,10 @@ def test_rows_behind_are_background_at_night_and_ignored_by_day():
 def test_a_stalk_that_leans_over_the_camera_keeps_its_lower_part():
     plot = draw(FEW, 3)
     camera, pose = drive(plot.family, plot.seed).true, drive(plot.family, plot.seed).poses[0]
-    stalk, lines = plot.stalks[0], np.arange(4.0, camera.height, 8.0)
+    stalk, rows = plot.stalks[0], np.arange(4.0, camera.height, 8.0)
     points = stalk.points.copy()
     points[:, :2] += np.linspace(0.0, 1.5, len(points))[:, None] ** 2 * (pose.position - points)[:, :2]
-    upright, leaning = (_sides(each, pose, camera, lines) for each in (stalk, dataclasses.replace(stalk, points=points)))
+    upright, leaning = (_sides(each, pose, camera, rows) for each in (stalk, dataclasses.replace(stalk, points=points)))
     assert upright is not None and leaning is not None
     assert pose.to_camera(points)[:, 2].min() < 0.0 and leaning[2][-3:].any()
     foot = np.flatnonzero(upright[2])[-1]

@@ -313,10 +313,10 @@ def test_a_stalk_counts_from_where_it_faces_the_camera():
 
 def test_an_edge_that_another_stalk_hides_is_not_its_own():
     def stalk(column: float, depth: float) -> Measurement:
-        return Measurement(14.0, 0.1, line=600.0, column=column, width=40.0, depth=depth, lean=0.1, confidence=0.8)
+        return Measurement(14.0, 0.1, row=600.0, column=column, width=40.0, depth=depth, lean=0.1, confidence=0.8)
 
     # The second stands before the right edge of the first; the third touches nothing, nor does the one that was not measured.
-    found = [stalk(100.0, 0.80), stalk(130.0, 0.77), stalk(300.0, 0.80), Measurement(line=600.0)]
+    found = [stalk(100.0, 0.80), stalk(130.0, 0.77), stalk(300.0, 0.80), Measurement(row=600.0)]
     assert _occluded_edges(found) == [True, False, False, False]
     # Of two that stand equally far away, either may hide the other's edge.
     assert _occluded_edges([found[0], dataclasses.replace(found[1], depth=0.799)]) == [True, True]

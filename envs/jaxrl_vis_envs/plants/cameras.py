@@ -77,8 +77,8 @@ class Drive:
         poses: Actual pose of the left camera for each of F pairs.
         times: [F] float64, times of the pairs, s.
         odometry: [F] float64, distance along the row reported by the robot, m, from 0.
-        line_offset: Downward offset of the right image, pixels.
-        line_slope: Change of this offset per column, pixels.
+        vertical_offset: Downward offset of the right image, pixels.
+        vertical_slope: Change of this offset per column, pixels.
     """
 
     true: Calibration
@@ -86,8 +86,8 @@ class Drive:
     poses: tuple[Pose, ...]
     times: np.ndarray
     odometry: np.ndarray
-    line_offset: float
-    line_slope: float
+    vertical_offset: float
+    vertical_slope: float
 
 
 def drive(family: Family, seed: int) -> Drive:

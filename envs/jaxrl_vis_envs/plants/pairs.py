@@ -136,11 +136,11 @@ class Sequence:
         settings = family.imaging
         flash, blur = rng.uniform(*settings.flash), rng.uniform(*settings.blur, 2)
         gains = np.exp(settings.exposure_spread * rng.normal(size=(len(self), 1)) + 0.01 * rng.normal(size=(len(self), 2)))
-        lines = np.array([drive.line_offset, drive.line_slope]) * camera_index
+        vertical_offset = np.array([drive.vertical_offset, drive.vertical_slope]) * camera_index
         values = (
             true.focal,
             true.centre,
-            lines,
+            vertical_offset,
             pose.rotation,
             pose.position + offset @ pose.rotation,
             _FLASH - offset,

@@ -112,24 +112,24 @@ def stalks_in_view(
             continue
         box, area = _extended_to_ground(projection[0], stalk, pose, camera), projection[1]
         rows, columns = _pixels(box, camera)
-        line, column = np.nonzero(instance[rows, columns] == index)
-        line, column = line + rows.start, column + columns.start
+        row, column = np.nonzero(instance[rows, columns] == index)
+        row, column = row + rows.start, column + columns.start
         part = _area(outline(stalk, pose, camera, np.linspace(*band, 40)), camera) if band[0] < tall else None
         within = 0
-        if part is not None and line.size:
+        if part is not None and row.size:
             x = (column - camera.centre[0]) / camera.focal
-            y = (line - camera.centre[1]) / camera.focal
-            points = np.stack([x, y, np.ones_like(x)], axis=1) * depth[line, column][:, None]
+            y = (row - camera.centre[1]) / camera.focal
+            points = np.stack([x, y, np.ones_like(x)], axis=1) * depth[row, column][:, None]
             height = pose.to_world(points)[:, 2]
             within = int(((height >= band[0]) & (height <= band[1])).sum())
-        visible_box = _bounding_box(column, line) if line.size else None
+        visible_box = _bounding_box(column, row) if row.size else None
         stalks.append(
             StalkInView(
                 stalk=index,
                 box=box,
                 visible_box=visible_box,
-                visible=min(line.size / area, 1.0),
-                pixels=int(line.size),
+                visible=min(row.size / area, 1.0),
+                pixels=int(row.size),
                 band_box=None if part is None else part[0],
                 band_visible=0.0 if part is None else min(within / part[1], 1.0),
             )
@@ -139,21 +139,21 @@ def stalks_in_view(
 
 def _area(edges: np.ndarray, camera: Calibration) -> tuple[Box, float] | None:
     """Return box and area (pixels) of the part of an outline [K, 2, 2] inside the image; None if it is empty."""
-    middle_line = edges[:, :, 1].mean(axis=1)
-    order = np.argsort(middle_line)
-    lines = np.arange(max(int(np.ceil(middle_line.min())), 0), min(int(np.floor(middle_line.max())), camera.height - 1) + 1)
-    if not lines.size:
+    middle_rows = edges[:, :, 1].mean(axis=1)
+    order = np.argsort(middle_rows)
+    rows = np.arange(max(int(np.ceil(middle_rows.min())), 0), min(int(np.floor(middle_rows.max())), camera.height - 1) + 1)
+    if not rows.size:
         return None
     sides = []
     for side in (0, 1):
-        line_order = np.argsort(edges[:, side, 1])
-        sides.append(np.interp(lines, edges[line_order, side, 1], edges[line_order, side, 0]))
+        row_order = np.argsort(edges[:, side, 1])
+        sides.append(np.interp(rows, edges[row_order, side, 1], edges[row_order, side, 0]))
     left, right = (np.clip(side, -0.5, camera.width - 0.5) for side in sides)
     wide = right - left
     inside = wide > 0
     if wide.sum() < 1.0:
         return None
-    top, bottom = middle_line[order[0]], middle_line[order[-1]]
+    top, bottom = middle_rows[order[0]], middle_rows[order[-1]]
     box = (left[inside].min(), max(top, -0.5), right[inside].max(), min(bottom, camera.height - 0.5))
     return tuple(map(float, box)), float(wide.sum())  # pyright: ignore[reportReturnType]
 
@@ -164,13 +164,13 @@ def _extended_to_ground(box: Box, stalk: Stalk, pose: Pose, camera: Calibration)
     foot = stalk.points[0].copy()
     foot[:2] += stalk.radius[0] * towards / np.linalg.norm(towards)
     _, y, z = pose.to_camera(foot)
-    line = y / z * camera.focal + camera.centre[1]
-    return (*box[:3], float(max(box[3], min(line, camera.height - 0.5))))
+    row = y / z * camera.focal + camera.centre[1]
+    return (*box[:3], float(max(box[3], min(row, camera.height - 0.5))))
 
 
-def _bounding_box(column: np.ndarray, line: np.ndarray) -> Box:
+def _bounding_box(column: np.ndarray, row: np.ndarray) -> Box:
     """Return the box around pixels."""
-    return (float(column.min()) - 0.5, float(line.min()) - 0.5, float(column.max()) + 0.5, float(line.max()) + 0.5)
+    return (float(column.min()) - 0.5, float(row.min()) - 0.5, float(column.max()) + 0.5, float(row.max()) + 0.5)
 
 
 def _pixels(box: Box, camera: Calibration) -> tuple[slice, slice]:

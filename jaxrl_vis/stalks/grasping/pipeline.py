@@ -260,8 +260,8 @@ def draw_points(left: np.ndarray, perception: Perception, calibration: Calibrati
     size = max(image.shape[1] // 170, 3)
     for index, point in enumerate(perception.points):
         x, y, z = mount.pose.to_camera(point.point)
-        column, line = calibration.focal * x / z + calibration.centre[0], calibration.focal * y / z + calibration.centre[1]
-        middle = (round(column), round(line))
+        column, row = calibration.focal * x / z + calibration.centre[0], calibration.focal * y / z + calibration.centre[1]
+        middle = (round(column), round(row))
         cv2.circle(image, middle, size, (255, 255, 0), -1, cv2.LINE_AA)
         cv2.circle(image, middle, size, (0, 0, 0), 1, cv2.LINE_AA)
         label_place = (middle[0] + size + 2, middle[1] + size)

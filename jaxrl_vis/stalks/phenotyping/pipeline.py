@@ -215,10 +215,10 @@ def _is_complete(record: dict[str, Any]) -> bool:
     Raises:
         KeyError, TypeError, ValueError: It is not, or the pair was skipped, which is then tried again.
     """
-    lines, columns = record["size"]
+    rows, columns = record["size"]
     for values in record["sightings"]:
         Sighting.read(values)
-    return all(isinstance(count, int) for count in (lines, columns, *_span(record["lines"]), *_span(record["columns"])))
+    return all(isinstance(count, int) for count in (rows, columns, *_span(record["lines"]), *_span(record["columns"])))
 
 
 def _span(values: Any) -> tuple[Any, Any]:
@@ -263,7 +263,7 @@ def _make_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles
     seen = view.detections if isinstance(view.detections, Detections) else Detections()
     return {
         "size": list(left.shape[:2]),
-        "lines": list(view.frame.lines),
+        "lines": list(view.frame.rows),
         "columns": list(view.frame.columns),
         "doubt": None if seen.doubt is None else round(seen.doubt, 4),
         "max_doubt": seen.max_doubt,

@@ -88,8 +88,8 @@ def _skyline(rng: np.random.Generator, height: float, roughness: tuple[float, fl
     """Sample a mask [*SHAPE] bool from the horizon up to an uneven skyline with a mean tangent of about ``height``."""
     line = sum(smooth_noise(rng, (1, size), (1, SHAPE[1]))[0] * weight for size, weight in zip((8, 60), roughness))
     top = _HORIZON * (1.0 - height * (0.5 + line) / REACH[0])
-    lines = np.arange(SHAPE[0])[:, None]
-    return (lines >= top) & (lines < _HORIZON + 12)
+    rows = np.arange(SHAPE[0])[:, None]
+    return (rows >= top) & (rows < _HORIZON + 12)
 
 
 def _trees(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
@@ -137,12 +137,12 @@ def _trunks(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
         bottom = _HORIZON + rng.integers(2, 40)
         colour = rng.uniform(0.03, 0.6) * np.array([1.0, rng.uniform(0.8, 1.0), rng.uniform(0.6, 1.0)])
         lean = rng.normal(0.0, 0.03)
-        lines, sway = np.arange(max(top, 0), bottom), abs(lean) * SHAPE[0]
+        rows, sway = np.arange(max(top, 0), bottom), abs(lean) * SHAPE[0]
         columns = np.arange(max(int(at - wide - sway), 0), min(int(at + wide + sway) + 1, SHAPE[1]))
-        offset = (columns - at - lean * (lines[:, None] - _HORIZON)) / (0.5 * wide)
+        offset = (columns - at - lean * (rows[:, None] - _HORIZON)) / (0.5 * wide)
         shade = np.clip(1.0 - offset**2, 0.0, 1.0)
         light = 0.5 + 0.8 * np.sqrt(shade) * (0.8 + 0.4 * rng.random(shade.shape))
-        part = picture[lines[0] : bottom, columns[0] : columns[-1] + 1]
+        part = picture[rows[0] : bottom, columns[0] : columns[-1] + 1]
         part[shade > 0] = (colour * light[..., None])[shade > 0]
     return picture
 
@@ -154,10 +154,10 @@ def _room(rng: np.random.Generator) -> np.ndarray:
     picture[:ceiling] *= rng.uniform(0.3, 1.0)
     for _ in range(rng.integers(5, 40)):
         is_lamp = rng.random() < 0.25
-        line = rng.integers(0, ceiling + 1) if is_lamp else rng.integers(ceiling, _HORIZON + 80)
+        row = rng.integers(0, ceiling + 1) if is_lamp else rng.integers(ceiling, _HORIZON + 80)
         column, tall, wide = rng.integers(0, SHAPE[1]), rng.integers(4, 60), rng.integers(4, 160)
         colour = np.full(3, rng.uniform(2.0, 6.0)) if is_lamp else rng.uniform(0.02, 0.9) * rng.uniform(0.6, 1.2, 3)
-        picture[line : line + tall, column : column + wide] = colour
+        picture[row : row + tall, column : column + wide] = colour
     return picture * (0.85 + 0.3 * smooth_noise(rng, (80, 120))[..., None])
 
 
@@ -169,8 +169,8 @@ def _photograph(rng: np.random.Generator) -> np.ndarray:
     with Image.open(paths[rng.integers(len(paths))]) as opened:
         photograph = np.asarray(opened.convert("RGB"))
     tall, wide = (int(length * rng.uniform(0.5, 1.0)) for length in photograph.shape[:2])
-    line, column = rng.integers(0, photograph.shape[0] - tall + 1), rng.integers(0, photograph.shape[1] - wide + 1)
-    part = Image.fromarray(photograph[line : line + tall, column : column + wide])
+    row, column = rng.integers(0, photograph.shape[0] - tall + 1), rng.integers(0, photograph.shape[1] - wide + 1)
+    part = Image.fromarray(photograph[row : row + tall, column : column + wide])
     part = part.resize((SHAPE[1], SHAPE[0]), Image.Resampling.BILINEAR)
     values = (np.asarray(part) / 255.0) ** 2.2
     return values[:, ::-1] if rng.random() < 0.5 else values

@@ -77,13 +77,13 @@ def render_blades(
     for index, polygon in enumerate(outline.tolist(), start=1):
         pen.polygon(polygon, fill=index)
     nearest = np.asarray(canvas)
-    line, column = np.nonzero(nearest)
-    blade = nearest[line, column] - 1
-    shown = seen[there[blade], 0, 2] < depth[line, column]
-    line, column, blade = line[shown], column[shown], blade[shown]
+    row, column = np.nonzero(nearest)
+    blade = nearest[row, column] - 1
+    shown = seen[there[blade], 0, 2] < depth[row, column]
+    row, column, blade = row[shown], column[shown], blade[shown]
     colours = _ground_at(radiance, instance, base) * blades.tint[there]
     covered = np.array(radiance)
-    covered[line, column] = colours[blade]
+    covered[row, column] = colours[blade]
     return covered
 
 
@@ -91,9 +91,9 @@ def _ground_at(radiance: np.ndarray, instance: np.ndarray, pixels: np.ndarray) -
     """Return the radiance [B, 3] of the ground at pixels (column, row) [B, 2]; its median where it is not visible."""
     ground = instance == GROUND
     median = np.median(radiance[ground], axis=0) if ground.any() else np.zeros(3)
-    column, line = np.round(pixels).astype(int).T
+    column, row = np.round(pixels).astype(int).T
     height, width = instance.shape
-    inside = (line >= 0) & (line < height) & (column >= 0) & (column < width)
-    line, column = np.clip(line, 0, height - 1), np.clip(column, 0, width - 1)
-    own = (inside & ground[line, column])[:, None]
-    return np.where(own, radiance[line, column], median)
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    row, column = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
+    own = (inside & ground[row, column])[:, None]
+    return np.where(own, radiance[row, column], median)

@@ -61,11 +61,11 @@ def _blur_motion(image: np.ndarray, length: float) -> np.ndarray:
 
 def _border(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     """Sample a mask [H, W] bool of bars or wedges at one or two sides."""
-    line, column = np.mgrid[0:height, 0:width]
+    row, column = np.mgrid[0:height, 0:width]
     covered = np.zeros((height, width), bool)
     for _ in range(rng.integers(1, 3)):
         side, size = rng.integers(4), rng.uniform(0.01, 0.15)
-        along, across = (line / height, column / width) if side < 2 else (column / width, line / height)
+        along, across = (row / height, column / width) if side < 2 else (column / width, row / height)
         across = across if side % 2 else 1.0 - across
         slope = rng.uniform(-1.0, 1.0) if rng.random() < 0.5 else 0.0
         bend = rng.uniform(-0.5, 0.5) if rng.random() < 0.3 else 0.0

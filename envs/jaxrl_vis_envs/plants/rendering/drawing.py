@@ -71,12 +71,12 @@ def render_view(
 
 @functools.cache
 def _joiner(tile: int, width: int, height: int):
-    columns, lines = -(-width // tile), -(-height // tile)
+    columns, rows = -(-width // tile), -(-height // tile)
 
     def join(position: jax.Array, *parts: jax.Array) -> jax.Array:
         tiles = jnp.concatenate(parts)[position]
-        tiles = tiles.reshape(lines, columns, *tiles.shape[1:])
-        image = jnp.moveaxis(tiles, 2, 1).reshape(lines * tile, columns * tile, *tiles.shape[4:])
+        tiles = tiles.reshape(rows, columns, *tiles.shape[1:])
+        image = jnp.moveaxis(tiles, 2, 1).reshape(rows * tile, columns * tile, *tiles.shape[4:])
         return image[:height, :width]
 
     return jax.jit(join)
@@ -115,10 +115,10 @@ def _render_tile(
     """Render one tile: radiance [size, size, 3], instance and depth [size, size]."""
     offsets = np.array(_RAYS[samples] if samples == 1 else ((0.0, 0.0), *_RAYS[samples]), np.float32)
     column = corner[0] + jnp.arange(size, dtype=jnp.float32)[None, None, :] + offsets[:, 0, None, None]
-    line = corner[1] + jnp.arange(size, dtype=jnp.float32)[None, :, None] + offsets[:, 1, None, None]
-    column, line = jnp.broadcast_arrays(column, line)
-    line = line - shot.lines[0] - shot.lines[1] * (column - shot.centre[0])
-    x, y = (column - shot.centre[0]) / shot.focal, (line - shot.centre[1]) / shot.focal
+    image_row = corner[1] + jnp.arange(size, dtype=jnp.float32)[None, :, None] + offsets[:, 1, None, None]
+    column, image_row = jnp.broadcast_arrays(column, image_row)
+    image_row = image_row - shot.vertical_offset[0] - shot.vertical_offset[1] * (column - shot.centre[0])
+    x, y = (column - shot.centre[0]) / shot.focal, (image_row - shot.centre[1]) / shot.focal
     hit = _first_hits(tables, shot, x, y, surfaces, cone_range, triangle_range)
     middle = Hit(*(part[0] for part in hit))
     if samples > 1:

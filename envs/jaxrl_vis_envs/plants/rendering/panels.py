@@ -152,11 +152,11 @@ def render_panels(
         if window is None:
             continue
         rows, columns = window
-        line = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None]
+        row = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None]
         column = np.arange(columns.start, columns.stop, dtype=np.float32)[None, :]
         # A pixel p at planar depth z is at (a, b) of the panel, where (a, b, 1) = z G p with the inverse G of the homography.
         first, second, third = (
-            (line * np.float32(g[1]) + np.float32(g[2])) + column * np.float32(g[0]) for g in np.linalg.inv(homography)
+            (row * np.float32(g[1]) + np.float32(g[2])) + column * np.float32(g[0]) for g in np.linalg.inv(homography)
         )
         with np.errstate(invalid="ignore"):  # nothing is infinitely far, and 0 times infinity
             inside = (third * depth[rows, columns] > 1.0) & (third < 1.0 / NEAR)
@@ -198,9 +198,9 @@ def _sample(picture: np.ndarray, across: np.ndarray, above: np.ndarray) -> np.nd
     """Interpolate a picture at coordinates [N] of its panel from 0 to 1: [N, 4] float32."""
     height, width = picture.shape[:2]
     column = np.clip(across * width - 0.5, 0.0, width - 1.001)
-    line = np.clip((1.0 - above) * height - 0.5, 0.0, height - 1.001)
-    left, top = column.astype(np.int32), line.astype(np.int32)
-    u, v = (column - left)[:, None], (line - top)[:, None]
+    row = np.clip((1.0 - above) * height - 0.5, 0.0, height - 1.001)
+    left, top = column.astype(np.int32), row.astype(np.int32)
+    u, v = (column - left)[:, None], (row - top)[:, None]
     flat, at = picture.reshape(-1, 4), top * width + left
     upper = flat[at] + (flat[at + 1] - flat[at]) * u
     lower = flat[at + width] + (flat[at + width + 1] - flat[at + width]) * u

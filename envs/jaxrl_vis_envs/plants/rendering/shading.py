@@ -36,7 +36,7 @@ class Shot(NamedTuple):
     Attributes:
         focal: [] focal length, pixels.
         centre: [2] principal point, pixels.
-        lines: [2] vertical offset of the image, pixels, and its slope per column; see `Drive`.
+        vertical_offset: [2] vertical offset of the image, pixels, and its slope per column; see `Drive`.
         rotation: [3, 3] from the world to the camera.
         position: [3] of the camera in the world, m.
         flash: [3] position of the flash in the camera's frame, m.
@@ -47,7 +47,7 @@ class Shot(NamedTuple):
 
     focal: jax.Array
     centre: jax.Array
-    lines: jax.Array
+    vertical_offset: jax.Array
     rotation: jax.Array
     position: jax.Array
     flash: jax.Array
@@ -211,12 +211,12 @@ def _daylight(
 def _backdrop(shot: Shot, day: Day, x: jax.Array, y: jax.Array) -> list[jax.Array]:
     """Look up the backdrop in the direction of rays (x, y, 1): red, green and blue."""
     along, ahead, above = (x * shot.rotation[0, k] + y * shot.rotation[1, k] + shot.rotation[2, k] for k in range(3))
-    lines, columns = day.backdrop.shape[:2]
+    rows, columns = day.backdrop.shape[:2]
     column = (0.5 + 0.5 * jnp.arctan2(along, ahead) / REACH[1]) * columns - 0.5
-    line = (0.5 - 0.5 * above / jnp.hypot(along, ahead) / REACH[0]) * lines - 0.5
-    column, line = jnp.clip(column, 0.0, columns - 1.001), jnp.clip(line, 0.0, lines - 1.001)
-    left, top = column.astype(jnp.int32), line.astype(jnp.int32)
-    u, v = (column - left)[..., None], (line - top)[..., None]
+    row = (0.5 - 0.5 * above / jnp.hypot(along, ahead) / REACH[0]) * rows - 0.5
+    column, row = jnp.clip(column, 0.0, columns - 1.001), jnp.clip(row, 0.0, rows - 1.001)
+    left, top = column.astype(jnp.int32), row.astype(jnp.int32)
+    u, v = (column - left)[..., None], (row - top)[..., None]
     upper = day.backdrop[top, left] * (1 - u) + day.backdrop[top, left + 1] * u
     lower = day.backdrop[top + 1, left] * (1 - u) + day.backdrop[top + 1, left + 1] * u
     colour = upper * (1 - v) + lower * v

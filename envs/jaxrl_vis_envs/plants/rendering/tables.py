@@ -69,28 +69,28 @@ def build_view(surfaces: Surfaces, pose: Pose, camera: Calibration, shift: float
         shift: Distance of this camera to the right of the left one, m.
     """
     tile = tile_size(camera.width)
-    columns, lines = (-(-size // tile) for size in (camera.width, camera.height))
+    columns, rows = (-(-size // tile) for size in (camera.width, camera.height))
     offset = np.array([shift, 0.0, 0.0])
 
     candidates = np.flatnonzero(_may_be_in_sight(surfaces.start, pose, camera))
     start, end = pose.to_camera(surfaces.start[candidates]) - offset, pose.to_camera(surfaces.end[candidates]) - offset
     reach = surfaces.radii[candidates].max(axis=1) * np.sqrt(surfaces.oval[candidates, 0]) * 1.15
     cone_boxes = _tile_boxes(np.stack([start, end], axis=1), reach, camera)
-    in_sight = _in_sight(cone_boxes, columns, lines)
+    in_sight = _in_sight(cone_boxes, columns, rows)
     cone_boxes, visible_cones = cone_boxes[in_sight], candidates[in_sight]
     cones = _cone_table(surfaces, visible_cones, start[in_sight], end[in_sight], pose)
 
     candidates = np.flatnonzero(_may_be_in_sight(surfaces.corners[:, 0], pose, camera))
     corners = pose.to_camera(surfaces.corners[candidates]) - offset
     triangle_boxes = _tile_boxes(corners, np.zeros(len(corners)), camera)
-    in_sight = _in_sight(triangle_boxes, columns, lines)
+    in_sight = _in_sight(triangle_boxes, columns, rows)
     in_sight[in_sight] = np.abs(np.linalg.det(corners[in_sight])) > 1e-12
     triangle_boxes, visible_triangles = triangle_boxes[in_sight], candidates[in_sight]
     triangles = _triangle_table(surfaces, visible_triangles, corners[in_sight], pose)
 
-    cone_list, cone_ranges = _list_by_tile(cone_boxes, columns, lines)
-    triangle_list, triangle_ranges = _list_by_tile(triangle_boxes, columns, lines)
-    line, column = np.divmod(np.arange(columns * lines), columns)
+    cone_list, cone_ranges = _list_by_tile(cone_boxes, columns, rows)
+    triangle_list, triangle_ranges = _list_by_tile(triangle_boxes, columns, rows)
+    row, column = np.divmod(np.arange(columns * rows), columns)
     return View(
         cones=_pad_rows(cones, _CONES),
         cone_instance=_pad_rows(surfaces.cone_stalk[visible_cones], _CONES),
@@ -99,7 +99,7 @@ def build_view(surfaces: Surfaces, pose: Pose, camera: Calibration, shift: float
         triangle_instance=_pad_rows(surfaces.triangle_instance[visible_triangles], _TRIANGLES),
         triangle_material=_pad_rows(surfaces.triangle_material[visible_triangles], _TRIANGLES),
         materials=_pad_rows(surfaces.materials, _MATERIALS),
-        tiles=(tile * np.stack([column, line], axis=1)).astype(np.int32),
+        tiles=(tile * np.stack([column, row], axis=1)).astype(np.int32),
         cone_ranges=cone_ranges,
         triangle_ranges=triangle_ranges,
         cone_list=_pad_rows(cone_list, _LIST),
@@ -146,8 +146,8 @@ def _tile_boxes(points: np.ndarray, reach: np.ndarray, camera: Calibration) -> n
     return np.clip(boxes, -1, 1 << 20).astype(np.int64)
 
 
-def _in_sight(boxes: np.ndarray, columns: int, lines: int) -> np.ndarray:
-    return (boxes[:, 0] < columns) & (boxes[:, 1] < lines) & (boxes[:, 2] >= 0) & (boxes[:, 3] >= 0)
+def _in_sight(boxes: np.ndarray, columns: int, rows: int) -> np.ndarray:
+    return (boxes[:, 0] < columns) & (boxes[:, 1] < rows) & (boxes[:, 2] >= 0) & (boxes[:, 3] >= 0)
 
 
 def _list_by_tile(boxes: np.ndarray, columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:

@@ -27,10 +27,10 @@ def approximate_normal(bits: jax.Array) -> jax.Array:
 
 def noise(x: jax.Array, y: jax.Array, layer: int) -> jax.Array:
     """Evaluate smooth noise float32 in [0, 1) with features of size 1 in both coordinates; layers are independent."""
-    column, line = jnp.floor(x), jnp.floor(y)
-    u, v = x - column, y - line
+    column, row = jnp.floor(x), jnp.floor(y)
+    u, v = x - column, y - row
     u, v = u * u * (3.0 - 2.0 * u), v * v * (3.0 - 2.0 * v)
-    left, top = column.astype(jnp.int32).astype(jnp.uint32), line.astype(jnp.int32).astype(jnp.uint32)
+    left, top = column.astype(jnp.int32).astype(jnp.uint32), row.astype(jnp.int32).astype(jnp.uint32)
 
     def corner(dx: int, dy: int) -> jax.Array:
         # One round of mixing suffices: neighbours differ by an odd multiple of a large number.

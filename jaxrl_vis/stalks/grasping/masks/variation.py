@@ -55,11 +55,11 @@ def _transform(values: jax.Array, masks: jax.Array, strength: jax.Array, key: ja
     draws = jax.random.uniform(key, (4, count), minval=-1.0, maxval=1.0)
     size, wide, shear = jnp.exp(0.3 * strength * draws[0]), jnp.exp(0.25 * strength * draws[1]), 0.2 * strength * draws[2]
     mirror = jnp.where(draws[3] > 0.0, 1.0, -1.0)
-    line, column = jnp.meshgrid(jnp.arange(height) - 0.5 * (height - 1), jnp.arange(width) - 0.5 * (width - 1), indexing="ij")
+    row, column = jnp.meshgrid(jnp.arange(height) - 0.5 * (height - 1), jnp.arange(width) - 0.5 * (width - 1), indexing="ij")
 
     def resample(image: jax.Array, mask: jax.Array, size: jax.Array, wide: jax.Array, shear: jax.Array, mirror: jax.Array):
-        y = jnp.clip(line / size + 0.5 * (height - 1), 0.0, height - 1.0)
-        x = jnp.clip(mirror * (column / wide + shear * line) / size + 0.5 * (width - 1), 0.0, width - 1.0)
+        y = jnp.clip(row / size + 0.5 * (height - 1), 0.0, height - 1.0)
+        x = jnp.clip(mirror * (column / wide + shear * row) / size + 0.5 * (width - 1), 0.0, width - 1.0)
         top, left = jnp.floor(y).astype(jnp.int32), jnp.floor(x).astype(jnp.int32)
         below, right = jnp.minimum(top + 1, height - 1), jnp.minimum(left + 1, width - 1)
         down, over = (y - top)[..., None], (x - left)[..., None]
@@ -72,16 +72,16 @@ def _transform(values: jax.Array, masks: jax.Array, strength: jax.Array, key: ja
     return jax.vmap(resample)(values, masks, size, wide, shear, mirror)
 
 
-def _smooth_noise(key: jax.Array, shape: tuple[int, ...], lines: int, columns: int, channels: int = 1) -> jax.Array:
+def _smooth_noise(key: jax.Array, shape: tuple[int, ...], rows: int, columns: int, channels: int = 1) -> jax.Array:
     """Sample smooth noise [N, H, W, channels] float32: normal values on a coarse grid, upsampled linearly.
 
     Args:
         key: Typed key, [].
         shape: Shape that begins with N, H and W.
-        lines, columns: Size of the grid; at least 2 are used.
+        rows, columns: Size of the grid; at least 2 are used.
         channels: Number of channels.
     """
-    coarse = jax.random.normal(key, (shape[0], max(lines, 2), max(columns, 2), channels))
+    coarse = jax.random.normal(key, (shape[0], max(rows, 2), max(columns, 2), channels))
     return jax.image.resize(coarse, (*shape[:3], channels), "linear")
 
 

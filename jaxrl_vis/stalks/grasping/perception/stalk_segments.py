@@ -51,30 +51,30 @@ def extract_stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount,
         jump = np.abs(np.diff(depth, axis=1)) > _JUMP
     begins = red.copy()
     begins[:, 1:] &= ~red[:, :-1] | jump
-    line, column = np.nonzero(red)
-    first = np.flatnonzero(begins[line, column])
+    row, column = np.nonzero(red)
+    first = np.flatnonzero(begins[row, column])
     if not first.size:
         return _empty_segments()
-    last = np.append(first[1:], len(line)) - 1
+    last = np.append(first[1:], len(row)) - 1
     length = column[last] - column[first] + 1.0
-    far = _middle_depth(depth[line, column], first, last)
+    far = _middle_depth(depth[row, column], first, last)
     thickness = length * far / calibration.focal
     good = (length >= _MIN_PIXELS) & np.isfinite(far) & (thickness < _MAX_THICKNESS)
-    line, far, thickness = line[first][good], far[good], thickness[good]
+    row, far, thickness = row[first][good], far[good], thickness[good]
     across = (0.5 * (column[first] + column[last]))[good]
-    if not len(line):
+    if not len(row):
         return _empty_segments()
-    piece = _split_runs(line, across, far)
+    piece = _split_runs(row, across, far)
     rays = np.stack(
         [
             (across - calibration.centre[0]) / calibration.focal,
-            (STEP * line - calibration.centre[1]) / calibration.focal,
-            np.ones(len(line)),
+            (STEP * row - calibration.centre[1]) / calibration.focal,
+            np.ones(len(row)),
         ],
         axis=1,
     )
     points = rays * (far + _BEHIND_FRONT * 0.5 * thickness)[:, None]
-    return StalkSegments(mount.pose.to_world(points), thickness, np.full(len(line), frame), piece)
+    return StalkSegments(mount.pose.to_world(points), thickness, np.full(len(row), frame), piece)
 
 
 def join_segments(segments: list[StalkSegments]) -> StalkSegments:
@@ -113,18 +113,18 @@ def _middle_depth(depth: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.
     return np.where(2 * valid >= end - begin, middle, np.nan).astype(np.float64)
 
 
-def _split_runs(line: np.ndarray, positions: np.ndarray, depth: np.ndarray) -> np.ndarray:
+def _split_runs(image_row: np.ndarray, positions: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Return the number [N] of the piece of each chord: connected components over neighbouring rows.
 
     Args:
-        line: [N] int, index of the processed row of each chord, ascending.
+        image_row: [N] int, index of the processed row of each chord, ascending.
         positions: [N], column of the middle of each chord, pixels.
         depth: [N], depth of each chord, m.
     """
-    count = len(line)
-    ends = np.searchsorted(line, np.arange(line.max() + 3))
+    count = len(image_row)
+    ends = np.searchsorted(image_row, np.arange(image_row.max() + 3))
     one, other = [], []
-    for here in range(line.max()):
+    for here in range(image_row.max()):
         upper, lower = np.arange(ends[here], ends[here + 1]), np.arange(ends[here + 1], ends[here + 2])
         if not (upper.size and lower.size):
             continue

@@ -45,9 +45,9 @@ class Visibility:
             height, width = cloud.depth.shape
             with np.errstate(divide="ignore", invalid="ignore"):
                 column = np.round(self.calibration.focal * x / z + self.calibration.centre[0])
-                line = np.round(self.calibration.focal * y / z + self.calibration.centre[1])
-                inside = (z > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
-            place = line[inside].astype(int), column[inside].astype(int)
+                row = np.round(self.calibration.focal * y / z + self.calibration.centre[1])
+                inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            place = row[inside].astype(int), column[inside].astype(int)
             with np.errstate(invalid="ignore"):
                 behind = cloud.depth[place] - z[inside]
                 shown[frame, inside] = cloud.mask[place] & (np.abs(behind) < _SAME)

@@ -23,8 +23,8 @@ def make_anchors(shape: tuple[int, int], height: float, widths: tuple[float, ...
         height: Height of all anchors (that of the band), pixels.
         widths: Widths of the anchors at each location, pixels.
     """
-    lines, columns = (-(-length // stride) for length, stride in zip(shape, ANCHOR_STRIDE))
-    y = (np.arange(lines) + 0.5) * ANCHOR_STRIDE[0]
+    rows, columns = (-(-length // stride) for length, stride in zip(shape, ANCHOR_STRIDE))
+    y = (np.arange(rows) + 0.5) * ANCHOR_STRIDE[0]
     x = (np.arange(columns) + 0.5) * ANCHOR_STRIDE[1]
     y, x, wide = np.meshgrid(y, x, np.asarray(widths), indexing="ij")
     half = 0.5 * height

@@ -58,7 +58,7 @@ def non_maximum_suppression(
     return jnp.zeros(scores.shape, bool).at[order].set(selected)
 
 
-def strip_overlap(first: jax.Array, second: jax.Array, lines: int = 8) -> jax.Array:
+def strip_overlap(first: jax.Array, second: jax.Array, heights: int = 8) -> jax.Array:
     """Compute the overlap [N, M] of stalks: intersection over union of their slanted strips instead of their boxes.
 
     The boxes of two parallel leaning stalks can overlap by half although the stalks are apart; their strips do not. Strips are
@@ -67,9 +67,9 @@ def strip_overlap(first: jax.Array, second: jax.Array, lines: int = 8) -> jax.Ar
 
     Args:
         first, second: Stalks [N, 6] and [M, 6]: boxes, and x coordinates of the axis at the top and bottom of the box.
-        lines: Number of heights at which strips are compared.
+        heights: Number of heights at which strips are compared.
     """
-    (low, high), (other_low, other_high) = _edges(first, lines), _edges(second, lines)
+    (low, high), (other_low, other_high) = _edges(first, heights), _edges(second, heights)
     common = jnp.minimum(high[:, None], other_high[None]) - jnp.maximum(low[:, None], other_low[None])
     common = jnp.maximum(common, 0.0).sum(-1)
     union = (high - low).sum(-1)[:, None] + (other_high - other_low).sum(-1)[None] - common
@@ -79,9 +79,9 @@ def strip_overlap(first: jax.Array, second: jax.Array, lines: int = 8) -> jax.Ar
     return across * jnp.clip(shared / jnp.maximum(shorter, 1e-6), 0.0, 1.0)
 
 
-def _edges(stalks: jax.Array, lines: int) -> tuple[jax.Array, jax.Array]:
-    """Return the x coordinates of the left and right edges of the strips of stalks [N, 6], both [N, lines]."""
-    middle = stalks[:, 4:5] + (stalks[:, 5:] - stalks[:, 4:5]) * (jnp.arange(lines) + 0.5) / lines
+def _edges(stalks: jax.Array, heights: int) -> tuple[jax.Array, jax.Array]:
+    """Return the x coordinates of the left and right edges of the strips of stalks [N, 6], both [N, heights]."""
+    middle = stalks[:, 4:5] + (stalks[:, 5:] - stalks[:, 4:5]) * (jnp.arange(heights) + 0.5) / heights
     half = strip_half_width(stalks)[:, None]
     return middle - half, middle + half
 
@@ -132,9 +132,9 @@ def roi_align(
         weight = jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.arange(length)), 0.0) * inside[..., None]
         return weight.reshape(*low.shape, cells, samples, length).mean(axis=-2)
 
-    lines = weights(scaled[:, 1], scaled[:, 3], size[0], height)
+    rows = weights(scaled[:, 1], scaled[:, 3], size[0], height)
     # Interpolation is separable. Rows go first, as stalks are taller than wide: this reduces the work most.
-    tall = jnp.einsum("nih,hwc->niwc", lines, features)
+    tall = jnp.einsum("nih,hwc->niwc", rows, features)
     if lean is None:
         return jnp.einsum("njw,niwc->nijc", weights(scaled[:, 0], scaled[:, 2], size[1], width), tall)
     moved = (lean * horizontal)[:, None] * ((jnp.arange(size[0]) + 0.5) / size[0] - 0.5)
@@ -196,7 +196,7 @@ def roi_columns(
     place = jnp.clip(place, 0.0, width - 1.0)
     first = jnp.floor(place).astype(jnp.int32)
     part = (place - first)[..., None]
-    line = jnp.arange(height)[None, :, None]
+    row = jnp.arange(height)[None, :, None]
     band = of_region[:, None, None]
-    values = rows[band, line, first] * (1.0 - part) + rows[band, line, jnp.minimum(first + 1, width - 1)] * part
+    values = rows[band, row, first] * (1.0 - part) + rows[band, row, jnp.minimum(first + 1, width - 1)] * part
     return (values * inside[..., None]).reshape(-1, height, cells, samples, channels).mean(axis=3)

@@ -100,19 +100,19 @@ def cut_chain(chain: Chain, top: float, bottom: float) -> np.ndarray:
     The axis is interpolated, or extrapolated by the slope of the outermost sections.
     """
     sections = chain.sections.astype(np.float64)
-    lines = np.stack([sections[:, 1], sections[:, 3]], axis=1).reshape(-1)
+    rows = np.stack([sections[:, 1], sections[:, 3]], axis=1).reshape(-1)
     columns = sections[:, 4:].reshape(-1)
     # Two sections that meet have two columns there: their mean.
-    lines, places = np.unique(lines, return_inverse=True)
+    rows, places = np.unique(rows, return_inverse=True)
     columns = np.bincount(places, columns) / np.bincount(places)
     middle = 0.5 * (sections[:, 1] + sections[:, 3])
-    inner = lines[(lines > top) & (lines < bottom)]
+    inner = rows[(rows > top) & (rows < bottom)]
     at = np.concatenate([[top], inner, [bottom]])
-    axis = np.interp(at, lines, columns)
+    axis = np.interp(at, rows, columns)
     for place, end, other in ((0, 0, 1), (-1, -1, -2)):
-        slope = (columns[end] - columns[other]) / (lines[end] - lines[other])
-        beyond = at[place] < lines[0] if end == 0 else at[place] > lines[-1]
-        axis[place] = columns[end] + slope * (at[place] - lines[end]) if beyond else axis[place]
+        slope = (columns[end] - columns[other]) / (rows[end] - rows[other])
+        beyond = at[place] < rows[0] if end == 0 else at[place] > rows[-1]
+        axis[place] = columns[end] + slope * (at[place] - rows[end]) if beyond else axis[place]
     half = 0.5 * np.interp(at, middle, chain.widths)
     return np.array([(axis - half).min(), top, (axis + half).max(), bottom, axis[0], axis[-1]], np.float32)
 

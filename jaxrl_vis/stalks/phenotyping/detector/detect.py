@@ -37,7 +37,7 @@ class Settings:
     Attributes:
         pixels_per_metre: Resolution, at the row of plants, to which images are resized before detection; 0 for networks trained
             on images of unknown cameras, which are resized to `width`.
-        width, lines: Width and height of a resized image of the training cameras, pixels. Images of unknown cameras are
+        width, height: Width and height of a resized image of the training cameras, pixels. Images of unknown cameras are
             downscaled to the width; narrower ones are not enlarged unless `pixels_per_metre` is 0.
         full_width: Image width in pixels at which stalk crops measure `crop_height` x `crop_width`; at fewer pixels per metre
             they shrink in proportion.
@@ -60,7 +60,7 @@ class Settings:
 
     pixels_per_metre: float = 677.5
     width: int = 844
-    lines: int = 676
+    height: int = 676
     full_width: int = 3376
     crop_height: int = 640
     crop_width: int = 128
@@ -132,8 +132,8 @@ jax.tree_util.register_dataclass(DetectorOutput, ["stalks", "scores", "valid", "
 
 def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
     """Round a height and width up to multiples of `PADDING`."""
-    lines, columns = (-(-length // PADDING) * PADDING for length in shape)
-    return lines, columns
+    height, width = (-(-length // PADDING) * PADDING for length in shape)
+    return height, width
 
 
 def normalize(images: jax.Array) -> jax.Array:
@@ -325,5 +325,5 @@ def init_detector(settings: Settings, key: jax.Array) -> Any:
 
 def pad_image(image: np.ndarray) -> np.ndarray:
     """Pad an image [h, w, 3] with zeros at the bottom and on the right, to multiples of `PADDING` in height and width."""
-    lines, columns = padded_shape(image.shape[:2])
-    return np.pad(image, ((0, lines - image.shape[0]), (0, columns - image.shape[1]), (0, 0)))
+    height, width = padded_shape(image.shape[:2])
+    return np.pad(image, ((0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0)))

@@ -88,7 +88,7 @@ def upper_segment(stalk: np.ndarray) -> np.ndarray:
     middle = 0.5 * (top + bottom) - UPPER_OFFSET * tall
     slope = (below - above) / max(tall, 1.0)
     first, last = middle - 0.25 * tall, middle + 0.25 * tall
-    ends = [above + slope * (line - top) for line in (first, last)]
+    ends = [above + slope * (row - top) for row in (first, last)]
     half = 0.5 * max(right - left - abs(below - above), 2.0)
     return np.array([min(ends) - half, first, max(ends) + half, last, *ends], np.float32)
 
@@ -117,11 +117,11 @@ def resize(image: np.ndarray, settings: Settings, pixels_per_metre: float | None
     """
     height, across = image.shape[:2]
     factor = resize_factor(across, settings, pixels_per_metre)
-    lines, columns = max(round(height * factor), 1), max(round(across * factor), 1)
-    if (lines, columns) == (height, across):
+    rows, columns = max(round(height * factor), 1), max(round(across * factor), 1)
+    if (rows, columns) == (height, across):
         return image, (1.0, 1.0)
     how = cv2.INTER_AREA if factor < 1.0 else cv2.INTER_LINEAR
-    return cv2.resize(image, (columns, lines), interpolation=how), (height / lines, across / columns)
+    return cv2.resize(image, (columns, rows), interpolation=how), (height / rows, across / columns)
 
 
 def pad_to_training_height(image: np.ndarray, settings: Settings) -> tuple[np.ndarray, int]:
@@ -138,12 +138,12 @@ def pad_to_training_height(image: np.ndarray, settings: Settings) -> tuple[np.nd
     Returns:
         Image, and the number of rows added at the top, negative if cropped.
     """
-    beyond = settings.lines - image.shape[0]
-    if 1.0 / _MAX_STRETCH <= image.shape[0] / settings.lines <= _MAX_STRETCH:
+    beyond = settings.height - image.shape[0]
+    if 1.0 / _MAX_STRETCH <= image.shape[0] / settings.height <= _MAX_STRETCH:
         return image, 0
     above = beyond // 2
     if beyond < 0:
-        return image[-above : settings.lines - above], above
+        return image[-above : settings.height - above], above
     return np.pad(image, ((above, beyond - above), (0, 0), (0, 0))), above
 
 
@@ -275,16 +275,16 @@ class Finder:
         return detections
 
     def _placed_masks(
-        self, image: jax.Array, stalks: np.ndarray, lines: int, relative_scale: float
+        self, image: jax.Array, stalks: np.ndarray, height: int, relative_scale: float
     ) -> list[tuple[np.ndarray, tuple[int, int]]]:
-        """Segment stalks [N, 6] in crops of ``lines`` rows at full resolution; return masks and their corners in the image."""
-        crops = self._segment(image, stalks, lines, relative_scale)
+        """Segment stalks [N, 6] in crops of ``height`` rows at full resolution; return masks and their corners in the image."""
+        crops = self._segment(image, stalks, height, relative_scale)
         return [paste_crop(crop, stalk, (image.shape[0], image.shape[1])) for crop, stalk in zip(crops, stalks)]
 
-    def _segment(self, on_device: jax.Array, stalks: np.ndarray, lines: int, relative_scale: float) -> np.ndarray:
+    def _segment(self, on_device: jax.Array, stalks: np.ndarray, height: int, relative_scale: float) -> np.ndarray:
         """Compute masks [N, h, w] float32 of the crops of stalks [N, 6]; ``relative_scale``: see `crop_shape`."""
         settings = self._settings
-        full = (lines, settings.crop_width)
+        full = (height, settings.crop_width)
         shape = crop_shape(full, relative_scale)
         if not len(stalks):
             return np.zeros((0, *shape), np.float32)
@@ -322,7 +322,7 @@ def cut_to_band(chains: list[Chain], scale: tuple[float, float], band: Band | No
 
 def in_frame(band: Band, frame: Frame) -> Band:
     """Convert the rows of the band from coordinates of the whole image to those of a frame."""
-    down, over = frame.lines[0], frame.columns[0]
+    down, over = frame.rows[0], frame.columns[0]
 
     def inside(column: float) -> tuple[float, float]:
         top, bottom = band(column + over)
@@ -335,17 +335,17 @@ def _is_inside_frame(stalk: np.ndarray, frame: Frame) -> bool:
     """Return True if more than half of a stalk's axis within the image, of ``stalk`` [6], lies outside the black borders."""
     if frame.shown is None:
         return True
-    shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]
-    line, column = (np.linspace(begin, end, 21).astype(int) for begin, end in (stalk[1:4:2], stalk[4:]))
-    there = (line >= 0) & (line < shown.shape[0]) & (column >= 0) & (column < shown.shape[1])
-    return bool(np.mean(shown[line[there], column[there]]) > _MIN_VISIBLE) if there.any() else False
+    shown = frame.shown[slice(*frame.rows), slice(*frame.columns)]
+    row, column = (np.linspace(begin, end, 21).astype(int) for begin, end in (stalk[1:4:2], stalk[4:]))
+    there = (row >= 0) & (row < shown.shape[0]) & (column >= 0) & (column < shown.shape[1])
+    return bool(np.mean(shown[row[there], column[there]]) > _MIN_VISIBLE) if there.any() else False
 
 
 def _clear_border_rows(mask: np.ndarray, corner: tuple[int, int], frame: Frame) -> np.ndarray:
     """Return a mask, cleared in the rows in which it reaches a black border: the stalk may continue there."""
     if frame.shown is None or not mask.size:
         return mask
-    shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]
+    shown = frame.shown[slice(*frame.rows), slice(*frame.columns)]
     here = shown[corner[0] : corner[0] + mask.shape[0], corner[1] : corner[1] + mask.shape[1]]
     visible = mask.copy()
     visible[((mask >= 0.5) & ~here).any(axis=1)] = 0
@@ -354,7 +354,7 @@ def _clear_border_rows(mask: np.ndarray, corner: tuple[int, int], frame: Frame) 
 
 def _to_full_image(detection: Detection, frame: Frame) -> Detection:
     """Convert a detection from the coordinates of a frame to those of the whole image."""
-    down, over = frame.lines[0], frame.columns[0]
+    down, over = frame.rows[0], frame.columns[0]
     if not down and not over:
         return detection
     left, top, right, bottom = detection.box
@@ -373,6 +373,6 @@ def _extrapolate_upward(stalk: np.ndarray, strip: Strip | None, corner: tuple[in
     if strip is None:
         return None
     # Half a pixel from pixel centres to the continuous coordinates of stalks.
-    axis = [0.5 * sum(strip.edges(line - 0.5 - corner[0])) + corner[1] + 0.5 for line in (stalk[1], stalk[3])]
+    axis = [0.5 * sum(strip.edges(row - 0.5 - corner[0])) + corner[1] + 0.5 for row in (stalk[1], stalk[3])]
     upper = upper_segment(np.array([*stalk[:4], *axis], np.float32))
     return upper if upper[1] > 0 else None

@@ -22,8 +22,8 @@ def crop_shape(full_shape: tuple[int, int], scale: float) -> tuple[int, int]:
         full_shape: Height and width of crops of a full-resolution image.
         scale: Resolution of the image relative to full resolution.
     """
-    lines, columns = (max(round(length * scale / 8), 2) * 8 for length in full_shape)
-    return lines, columns
+    height, width = (max(round(length * scale / 8), 2) * 8 for length in full_shape)
+    return height, width
 
 
 def crop_positions(stalks: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -41,8 +41,8 @@ def crop_positions(stalks: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarr
     middle = 0.5 * (stalks[:, 1] + stalks[:, 3])
     top = np.round(middle - 0.5 * shape[0]).astype(np.int32)
     tall = np.maximum(stalks[:, 3] - stalks[:, 1], 1.0)
-    line = top[:, None] + np.arange(shape[0]) + 0.5
-    fraction = (line - stalks[:, 1:2]) / tall[:, None]
+    row = top[:, None] + np.arange(shape[0]) + 0.5
+    fraction = (row - stalks[:, 1:2]) / tall[:, None]
     axis = stalks[:, 4:5] + (stalks[:, 5:6] - stalks[:, 4:5]) * fraction
     return top, np.round(axis - 0.5 * shape[1]).astype(np.int32)
 
@@ -60,10 +60,10 @@ def cut_crops(image: jax.Array, stalks: np.ndarray, shape: tuple[int, int]) -> j
 
 @functools.partial(jax.jit, static_argnums=3)
 def _cut(image: jax.Array, top: jax.Array, left: jax.Array, width: int) -> jax.Array:
-    lines = top[:, None] + jnp.arange(left.shape[1])
+    rows = top[:, None] + jnp.arange(left.shape[1])
     columns = left[..., None] + jnp.arange(width)
-    inside = ((lines >= 0) & (lines < image.shape[0]))[..., None] & (columns >= 0) & (columns < image.shape[1])
-    taken = image[jnp.clip(lines, 0, image.shape[0] - 1)[..., None], jnp.clip(columns, 0, image.shape[1] - 1)]
+    inside = ((rows >= 0) & (rows < image.shape[0]))[..., None] & (columns >= 0) & (columns < image.shape[1])
+    taken = image[jnp.clip(rows, 0, image.shape[0] - 1)[..., None], jnp.clip(columns, 0, image.shape[1] - 1)]
     return jnp.where(inside.reshape(*inside.shape, *(1,) * (image.ndim - 2)), taken, jnp.zeros((), image.dtype))
 
 

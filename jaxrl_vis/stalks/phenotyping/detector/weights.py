@@ -27,6 +27,7 @@ _COMMAND = "jaxrl-vis phenotype train"
 _HINTS = fields.hints(Settings)
 _KEYS = {
     "pixels_per_metre": "density",
+    "height": "lines",
     "crop_height": "snip_lines",
     "crop_width": "snip_columns",
     "band_height": "band_lines",

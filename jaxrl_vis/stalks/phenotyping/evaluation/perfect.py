@@ -27,10 +27,10 @@ def perfect_detections(stalks: Iterable[Mapping[str, Any]], instance: np.ndarray
         first, last = max(round(left) - 3, 0), min(round(right) + 4, width)
         upper, lower = max(round(top), 0), min(round(bottom) + 1, height)
         mask = instance[upper:lower, first:last] == stalk["stalk"]
-        line, column = np.nonzero(mask)
-        if line.size < 50 or np.ptp(line) < 4:
+        row, column = np.nonzero(mask)
+        if row.size < 50 or np.ptp(row) < 4:
             continue
-        slope, offset = np.polyfit(line + upper, column + first, 1)
+        slope, offset = np.polyfit(row + upper, column + first, 1)
         axis = (float(offset + slope * top), float(offset + slope * bottom))
         above = _upper_mask(np.array([left, top, right, bottom, *axis]) + 0.5, instance, stalk["stalk"])
         detections.append(Detection((left, top, right, bottom), axis, 1.0, mask, (upper, first), above))
@@ -50,5 +50,5 @@ def _upper_mask(stalk: np.ndarray, instance: np.ndarray, index: int) -> tuple[np
     first, last = max(round(left - margin), 0), min(round(right + margin), instance.shape[1])
     if top <= 0 or last <= first:
         return None
-    lines = slice(round(top), round(bottom))
-    return instance[lines, first:last] == index, (lines.start, first)
+    rows = slice(round(top), round(bottom))
+    return instance[rows, first:last] == index, (rows.start, first)

@@ -150,9 +150,9 @@ def _annotation(frame: int, stalk: StalkInView, instance: np.ndarray, with_mask:
         "visible": round(stalk.visible, 4),
     }
     if with_mask:
-        lines, columns = slice(int(top + 0.5), int(bottom + 0.5)), slice(int(left + 0.5), int(right + 0.5))
-        mask = instance[lines, columns] == stalk.stalk
-        annotation["segmentation"] = encode_mask(mask, (lines.start, columns.start), instance.shape)
+        rows, columns = slice(int(top + 0.5), int(bottom + 0.5)), slice(int(left + 0.5), int(right + 0.5))
+        mask = instance[rows, columns] == stalk.stalk
+        annotation["segmentation"] = encode_mask(mask, (rows.start, columns.start), instance.shape)
     return annotation
 
 

@@ -24,8 +24,8 @@ def encode_mask(mask: np.ndarray, corner: tuple[int, int], size: tuple[int, int]
         ``size`` and ``counts``; an empty mask has one run.
     """
     height, width = size
-    column, line = np.nonzero(mask.T)
-    place = (column + corner[1]) * height + line + corner[0]
+    column, row = np.nonzero(mask.T)
+    place = (column + corner[1]) * height + row + corner[0]
     breaks = np.flatnonzero(np.diff(place) > 1)
     starts = place[np.concatenate([[0], breaks + 1])] if place.size else place
     ends = place[np.concatenate([breaks, [place.size - 1]])] + 1 if place.size else place
@@ -80,11 +80,11 @@ def rasterize_polygons(outlines: list[list[float]], size: tuple[int, int]) -> np
         some = max(_CHUNK_SIZE // max(len(middles), 1), 1)  # edges per batch: an outline may have millions
         for start in range(0, len(here), some):
             one, other = here[start : start + some], ahead[start : start + some]
-            edge, line = np.nonzero((one[:, 1:] <= middles) != (other[:, 1:] <= middles))
-            fraction = (middles[line] - one[edge, 1]) / (other[edge, 1] - one[edge, 1])
+            edge, row = np.nonzero((one[:, 1:] <= middles) != (other[:, 1:] <= middles))
+            fraction = (middles[row] - one[edge, 1]) / (other[edge, 1] - one[edge, 1])
             crossing = one[edge, 0] + fraction * (other[edge, 0] - one[edge, 0])
             # A pixel is inside if the number of crossings to its left is odd.
-            np.add.at(crossings, (line, np.clip(np.ceil(crossing - 0.5), 0, width).astype(int)), 1)
+            np.add.at(crossings, (row, np.clip(np.ceil(crossing - 0.5), 0, width).astype(int)), 1)
         mask[first:last] |= np.cumsum(crossings[:, :width], axis=1) % 2 == 1
     return mask
 

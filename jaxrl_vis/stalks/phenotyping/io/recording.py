@@ -217,18 +217,18 @@ def _decode_pixels(message: Any, source: str) -> np.ndarray:
     channels, deep = _CHANNELS.get(encoding, 1), "16" in encoding
     if encoding not in _CHANNELS and encoding not in _MOSAICS:
         raise RequestError(f"{source}: images are encoded as {encoding[:40]}; {', '.join((*_CHANNELS, *_MOSAICS))} can be read")
-    row = width * channels * (2 if deep else 1)
+    row_bytes = width * channels * (2 if deep else 1)
     data = np.asarray(message.data, np.uint8)
-    if not 0 < width * height <= MAX_PIXELS or step < row or data.size < step * height:
+    if not 0 < width * height <= MAX_PIXELS or step < row_bytes or data.size < step * height:
         raise RequestError(f"{source}: an image of {width} x {height} ({encoding}) has {data.size} bytes, {step} a line")
-    lines = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :row])
+    rows = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :row_bytes])
     if deep:
-        return lines.view(">u2" if message.is_bigendian else "<u2").astype(np.uint16)
+        return rows.view(">u2" if message.is_bigendian else "<u2").astype(np.uint16)
     if encoding in _MOSAICS:
-        return cv2.cvtColor(lines, _MOSAICS[encoding])
-    pixels = lines.reshape(height, width, channels)
+        return cv2.cvtColor(rows, _MOSAICS[encoding])
+    pixels = rows.reshape(height, width, channels)
     colours = pixels[..., 2::-1] if encoding.startswith(("bgr", "8UC3")) else pixels[..., :3]
-    return lines if channels == 1 else np.ascontiguousarray(colours)
+    return rows if channels == 1 else np.ascontiguousarray(colours)
 
 
 def _write_odometry(path: Path, message_types: dict[str, str], messages: Any) -> None:

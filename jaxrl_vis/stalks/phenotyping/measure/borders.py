@@ -13,7 +13,7 @@ import numpy as np
 _DARK = 12  # maximum value in a border: JPEG edges ring
 _FILLED = 1.0  # maximum mean value of a border, away from its side
 _RINGING = 16  # pixels: reach of JPEG ringing into a border
-_MIN_LINES = 0.08  # minimum length of a border's side, as a fraction of the image's
+_MIN_LENGTH = 0.08  # minimum length of a border's side, as a fraction of the image's
 _MAX_RESIDUAL = 2.5  # pixels: maximum distance of a border's side from a smooth curve
 _MIN_AGREEING = 0.9  # minimum fraction of a side's rows that lie on the curve
 _MAX_END_WIDTH = 8.0  # pixels: maximum width of a border at an end within the image
@@ -25,11 +25,11 @@ class Frame:
     """Part of an image that shows the scene, without black borders.
 
     Attributes:
-        lines, columns: Half-open ranges of the rows and columns of its bounding box.
+        rows, columns: Half-open ranges of the rows and columns of its bounding box.
         shown: [H, W] bool, True for pixels of the scene; None if these are the whole bounding box.
     """
 
-    lines: tuple[int, int]
+    rows: tuple[int, int]
     columns: tuple[int, int]
     shown: np.ndarray | None = None
 
@@ -39,14 +39,14 @@ def find_frame(image: np.ndarray) -> Frame:
     channels = image.shape[2] if image.ndim == 3 else 1
     dark = cv2.inRange(image, (0,) * channels, (_DARK,) * channels) > 0
     lit = ~dark
-    lines, columns = (_extent(image, lit.any(axis=1 - axis), axis) for axis in (0, 1))
-    part = image[slice(*lines), slice(*columns)]
-    outside = _border_wedges(part, dark[slice(*lines), slice(*columns)])
+    rows, columns = (_extent(image, lit.any(axis=1 - axis), axis) for axis in (0, 1))
+    part = image[slice(*rows), slice(*columns)]
+    outside = _border_wedges(part, dark[slice(*rows), slice(*columns)])
     if not outside.any():
-        return Frame(lines, columns)
+        return Frame(rows, columns)
     shown = np.zeros(dark.shape, bool)
-    shown[slice(*lines), slice(*columns)] = ~outside
-    return Frame(lines, columns, shown)
+    shown[slice(*rows), slice(*columns)] = ~outside
+    return Frame(rows, columns, shown)
 
 
 def _extent(image: np.ndarray, lit: Any, axis: int) -> tuple[int, int]:
@@ -93,11 +93,11 @@ def _border_width(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
         dark: [H, W] bool, True where all channels are dark.
         image: [H, W, 3] or [H, W] uint8.
     """
-    if np.count_nonzero(dark[:, 0]) < _MIN_LINES * dark.shape[0]:
+    if np.count_nonzero(dark[:, 0]) < _MIN_LENGTH * dark.shape[0]:
         return None
     depth = np.where(dark.all(axis=1), 0, np.argmin(dark, axis=1))
     there = np.flatnonzero(depth > _WIDENING)
-    if there.size < max(_MIN_LINES * dark.shape[0], _RINGING):
+    if there.size < max(_MIN_LENGTH * dark.shape[0], _RINGING):
         return None
     # Consider all rows between its ends, as a border is contiguous.
     first, last = int(there[0]), int(there[-1]) + 1
@@ -129,16 +129,16 @@ def fill_borders(image: np.ndarray, frame: Frame) -> np.ndarray:
     Returns:
         [h, w, 3], a view of the image if no border remains.
     """
-    part = image[slice(*frame.lines), slice(*frame.columns)]
+    part = image[slice(*frame.rows), slice(*frame.columns)]
     if frame.shown is None:
         return part
-    shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]
+    shown = frame.shown[slice(*frame.rows), slice(*frame.columns)]
     # Each border pixel gets the value of the nearest pixel of the scene.
     _, labels = cv2.distanceTransformWithLabels((~shown).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     labels = labels.astype(np.int64)
-    line, column = np.nonzero(shown)
+    row, column = np.nonzero(shown)
     sources = np.zeros((int(labels.max()) + 1, 2), np.int64)
-    sources[labels[line, column]] = np.stack([line, column], axis=1)
+    sources[labels[row, column]] = np.stack([row, column], axis=1)
     hidden = np.nonzero(~shown)
     nearest = sources[labels[hidden]]
     filled = part.copy()

@@ -37,8 +37,8 @@ def diameter_mm(
     axis = np.array([math.tan(lean), -1.0, math.tan(tilt)])
     axis /= np.linalg.norm(axis)
     rays = []
-    for column, line in (left, right):
-        ray = np.array([column - calibration.centre[0], line - calibration.centre[1], calibration.focal])
+    for column, row in (left, right):
+        ray = np.array([column - calibration.centre[0], row - calibration.centre[1], calibration.focal])
         ray -= (ray @ axis) * axis
         rays.append(ray / np.linalg.norm(ray))
     half = 0.5 * math.acos(min(max(float(rays[0] @ rays[1]), -1.0), 1.0))

@@ -17,7 +17,7 @@ from jaxrl_vis_envs.plants.truth import BAND
 
 _FOCAL = 1084.0  # pixels: focal length of the downscaled images, in which the grain of the ground remains visible
 _WINDOW = (5, 41)  # height and width in the downscaled image: flat, as the depth of the ground changes from row to row
-_COLUMNS, _LINES = 32, 32  # numbers of windows horizontally and vertically
+_COLUMNS, _ROWS = 32, 32  # numbers of windows horizontally and vertically
 _MIN_SCORE = 0.7
 _TOLERANCE = 0.7  # pixels of the downscaled image
 _TRIES = 600
@@ -44,20 +44,20 @@ class Ground:
         """Height of the left camera above the ground, m."""
         return 1.0 / math.hypot(*self.normal)
 
-    def height(self, column: float, line: float, depth: float, calibration: Calibration) -> float:
+    def height(self, column: float, row: float, depth: float, calibration: Calibration) -> float:
         """Return the height of a point above the ground, m.
 
         Args:
-            column, line: Position in the left image, pixels.
+            column, row: Position in the left image, pixels.
             depth: Planar depth, m.
             calibration: Calibration of the cameras.
         """
         x = (column - calibration.centre[0]) / calibration.focal
-        y = (line - calibration.centre[1]) / calibration.focal
+        y = (row - calibration.centre[1]) / calibration.focal
         across, down, forwards = self.normal
         return (1.0 - depth * (across * x + down * y + forwards)) * self.camera_height
 
-    def line(self, column: float, height: float, depth: float, calibration: Calibration) -> float:
+    def row(self, column: float, height: float, depth: float, calibration: Calibration) -> float:
         """Return the row of a point in a column at a ``height`` above the ground and a ``depth``, m; inverse of `height`."""
         x = (column - calibration.centre[0]) / calibration.focal
         across, down, forwards = self.normal
@@ -65,13 +65,13 @@ class Ground:
         return y * calibration.focal + calibration.centre[1]
 
 
-def band_lines(ground: Ground | None, calibration: Calibration, distance: float, column: float) -> tuple[float, float]:
+def band_rows(ground: Ground | None, calibration: Calibration, distance: float, column: float) -> tuple[float, float]:
     """Return the first and last image row of the band in a column of the left image, for stalks at a ``distance`` in m.
 
     Without a ground plane, cameras are assumed to be level and at their usual height.
     """
     plane = ground or Ground((0.0, 1.0 / _USUAL_HEIGHT, 0.0))
-    top, bottom = (plane.line(column, height, distance, calibration) for height in reversed(BAND))
+    top, bottom = (plane.row(column, height, distance, calibration) for height in reversed(BAND))
     return top, bottom
 
 
@@ -91,7 +91,7 @@ def find_ground(
         depths: Minimum and maximum depth of matched windows, m; unused with ``disparity``.
     """
     frame = find_frame(left)
-    part = (slice(*frame.lines), slice(*frame.columns))
+    part = (slice(*frame.rows), slice(*frame.columns))
     left, right = left[part], right[part]
     disparity = None if disparity is None else disparity[part]
     scale = min(_FOCAL / calibration.focal, 1.0)
@@ -106,7 +106,7 @@ def find_ground(
     if len(values) < _MIN_WINDOWS:
         return None
     focal = calibration.focal * scale
-    corner = np.array([frame.columns[0], frame.lines[0]])
+    corner = np.array([frame.columns[0], frame.rows[0]])
     centre = (np.array(calibration.centre) - corner + 0.5) * scale - 0.5
     # Inverse depth, which is linear in the rays to points of a plane; `unit` is the change per pixel of disparity.
     unit = 1.0 / (focal * calibration.baseline)
@@ -139,9 +139,9 @@ def _match_windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, flo
     height, width = left.shape
     low, high = math.floor(bounds[0]), math.ceil(bounds[1])
     columns = np.linspace(low + 1, width - wide - 1, _COLUMNS).astype(int)
-    lines = np.linspace(1, height - tall - 1, _LINES).astype(int)
+    rows = np.linspace(1, height - tall - 1, _ROWS).astype(int)
     places, values = [], []
-    for top in lines:
+    for top in rows:
         for first in columns:
             window = left[top : top + tall, first : first + wide]
             begin, end = max(first - high - 1, 0), first - low + 1 + wide
@@ -161,11 +161,11 @@ def _match_windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, flo
 
 def _samples(disparity: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Sample positions [N, 2] and disparities [N], as in `_match_windows`, from disparities [H, W] in full-size pixels."""
-    lines, columns = (np.linspace(0, size - 1, 64).astype(int) for size in disparity.shape)
-    values = disparity[np.ix_(lines, columns)]
-    line, column = np.nonzero(np.isfinite(values))
-    places = (np.stack([columns[column], lines[line]], axis=1) + 0.5) * scale - 0.5
-    return places, values[line, column] * scale
+    rows, columns = (np.linspace(0, size - 1, 64).astype(int) for size in disparity.shape)
+    values = disparity[np.ix_(rows, columns)]
+    row, column = np.nonzero(np.isfinite(values))
+    places = (np.stack([columns[column], rows[row]], axis=1) + 0.5) * scale - 0.5
+    return places, values[row, column] * scale
 
 
 def _fit_plane(rays: np.ndarray, inverse: np.ndarray, tolerance: float) -> np.ndarray | None:

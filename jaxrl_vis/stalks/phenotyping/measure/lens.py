@@ -26,17 +26,17 @@ VALIDATED = LensRange(pixels_per_metre=640.0, view=0.68)
 `benchmarks.stalks.lenses`, as rows are not exactly 0.8 m away."""
 
 
-def lens_fault(calibration: Calibration, distance: float, lines: int, validated: LensRange = VALIDATED) -> str | None:
+def lens_fault(calibration: Calibration, distance: float, height: int, validated: LensRange = VALIDATED) -> str | None:
     """Return a message on why a lens is outside a range; None if it is within.
 
     Args:
         calibration: Calibration of the cameras.
         distance: Distance from the cameras to the row of plants, m.
-        lines: Height of the images without black borders, pixels.
+        height: Height of the images without black borders, pixels.
         validated: Range of validated lenses.
     """
     pixels_per_metre = calibration.focal / distance
-    view = lines / pixels_per_metre
+    view = height / pixels_per_metre
     if pixels_per_metre < validated.pixels_per_metre:
         return (
             f"{pixels_per_metre:.0f} pixels per metre of a row {distance:.2f} m away, fewer than the "

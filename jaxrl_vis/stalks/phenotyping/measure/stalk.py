@@ -27,7 +27,7 @@ class Measurement:
     Attributes:
         diameter_mm: Diameter perpendicular to the axis; None if it could not be measured, see ``reason``.
         deviation_mm: Standard error of the diameter from edges and disparity, mm, without effects of occlusion and sheaths.
-        line: Row of the left image at which the stalk was measured, pixels.
+        row: Row of the left image at which the stalk was measured, pixels.
         column: Column of the stalk's centre line in that row, pixels.
         width: Width perpendicular to the axis, pixels.
         disparity: Disparity in that row, pixels.
@@ -43,7 +43,7 @@ class Measurement:
 
     diameter_mm: float | None = None
     deviation_mm: float = math.nan
-    line: float = math.nan
+    row: float = math.nan
     column: float = math.nan
     width: float = math.nan
     disparity: float = math.nan
@@ -62,7 +62,7 @@ def measure_stalk(
     left: np.ndarray,
     right: np.ndarray,
     calibration: Calibration,
-    line: float | None = None,
+    row: float | None = None,
     depths: tuple[float, float] = DEPTHS,
     method: Method = "strip",
     ground: Ground | None = None,
@@ -77,12 +77,12 @@ def measure_stalk(
         corner: Image row and column of the first pixel of the mask.
         left, right: Rectified greyscale images [H, W], uint8 or float32.
         calibration: Calibration of the cameras, for images of this size.
-        line: Image row at which to measure; None for the middle of the visible part.
+        row: Image row at which to measure; None for the middle of the visible part.
         depths: Minimum and maximum depth of a stalk, m.
         method: ``strip``, or ``ellipse`` as in the thesis, which measures the width of the mask as a whole instead of at a row.
         ground: Ground plane, the reference for heights; None if unknown.
         height: Height above the ground at which to measure, m, or as near to it as both edges are visible. With both ``ground``
-            and ``height``, ``line`` is ignored.
+            and ``height``, ``row`` is ignored.
         disparity: Known disparities [H, W] float32 to use instead of matching, pixels; NaN where unknown. None to match.
         strip: Edges of the mask; None to fit them.
     """
@@ -90,24 +90,24 @@ def measure_stalk(
     if strip is None:
         return Measurement(reason="too few lines show both edges")
     confidence = strip.confidence
-    place = strip.reference if line is None else line - corner[0]
+    place = strip.reference if row is None else row - corner[0]
     matched = _disparity(strip, corner, left, right, calibration, depths, disparity)
     if ground is not None and height is not None:
         place = _row_at_height(height, strip, corner, matched, calibration, ground)
     disparity_here = matched.at(place + corner[0])
     if disparity_here is None:
-        return Measurement(line=place + corner[0], lean=strip.lean, reason="the right image does not show it clearly")
+        return Measurement(row=place + corner[0], lean=strip.lean, reason="the right image does not show it clearly")
     shift, error = disparity_here
     depth = float(calibration.depth(np.array(shift)))
     if not depths[0] <= depth <= depths[1]:
-        return Measurement(line=place + corner[0], depth=depth, lean=strip.lean, reason=f"it stands {depth:.2f} m away")
+        return Measurement(row=place + corner[0], depth=depth, lean=strip.lean, reason=f"it stands {depth:.2f} m away")
     reach = _REACH * calibration.focal / depth
     near = fit_strip_near(strip, place, reach, mask.shape[0])
     strip = refine_edges(near or strip, left, corner, place, reach)
     middle = 0.5 * sum(strip.edges(place))
     pixels = strip.width(place) if method == "strip" else ellipse_width(mask)
     if pixels is None:
-        return Measurement(line=place + corner[0], lean=strip.lean, reason="no ellipse fits the mask")
+        return Measurement(row=place + corner[0], lean=strip.lean, reason="no ellipse fits the mask")
     half = 0.5 * pixels / math.cos(strip.lean)
     edges = tuple((middle + corner[1] + side * half, place + corner[0]) for side in (-1.0, 1.0))
     tilt = _tilt(matched, shift, calibration)
@@ -119,7 +119,7 @@ def measure_stalk(
     return Measurement(
         diameter_mm=diameter,
         deviation_mm=diameter * relative,
-        line=place + corner[0],
+        row=place + corner[0],
         column=middle + corner[1],
         width=pixels,
         disparity=shift,
@@ -194,11 +194,11 @@ def stalk_disparity(
         disparity: Known disparities [H, W] float32 to sample instead of matching, pixels; NaN where unknown. None to match.
     """
     half = max(round(8 * calibration.focal / 2168), 3)
-    lines = np.unique(np.linspace(strip.first + half, max(strip.last - half, strip.first + half), _WINDOWS).round()).astype(int)
-    edges = np.array([strip.edges(line) for line in lines]) + corner[1]
+    rows = np.unique(np.linspace(strip.first + half, max(strip.last - half, strip.first + half), _WINDOWS).round()).astype(int)
+    edges = np.array([strip.edges(row) for row in rows]) + corner[1]
     if disparity is not None:
-        return sample_rows(disparity, lines + corner[0], (edges[:, 0], edges[:, 1]), bounds)
-    return match_rows(left, right, lines + corner[0], (edges[:, 0], edges[:, 1]), bounds, half)
+        return sample_rows(disparity, rows + corner[0], (edges[:, 0], edges[:, 1]), bounds)
+    return match_rows(left, right, rows + corner[0], (edges[:, 0], edges[:, 1]), bounds, half)
 
 
 def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -> float:
@@ -209,9 +209,9 @@ def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -
         disparity: Disparity at the row of the measurement, pixels.
         calibration: Calibration of the cameras.
     """
-    if matched.lines.size < 6 or np.ptp(matched.lines) < 0.03 * calibration.focal:
+    if matched.rows.size < 6 or np.ptp(matched.rows) < 0.03 * calibration.focal:
         return 0.0
-    first, second = index_pairs(matched.lines.size, 3)
-    slopes = (matched.values[second] - matched.values[first]) / (matched.lines[second] - matched.lines[first])
+    first, second = index_pairs(matched.rows.size, 3)
+    slopes = (matched.values[second] - matched.values[first]) / (matched.rows[second] - matched.rows[first])
     tilt = tilt_from_disparity(median(slopes), disparity, calibration)
     return tilt if abs(tilt) < math.radians(30.0) else 0.0

@@ -32,18 +32,18 @@ class StalkDisparity:
     """Disparities of one stalk.
 
     Attributes:
-        lines: [N] float64, centre row of each matched window.
+        rows: [N] float64, centre row of each matched window.
         values: [N] float64, disparity of each, pixels.
         scores: [N] float64, normalised cross-correlation of each, up to 1; 1 for sampled disparities.
         window_count: Number of windows, including unmatched ones.
     """
 
-    lines: np.ndarray
+    rows: np.ndarray
     values: np.ndarray
     scores: np.ndarray
     window_count: int
 
-    def at(self, line: float) -> tuple[float, float] | None:
+    def at(self, row: float) -> tuple[float, float] | None:
         """Estimate the disparity in an image row by a robust straight-line fit to the windows.
 
         Returns:
@@ -51,11 +51,11 @@ class StalkDisparity:
             windows tried.
         """
         minimum = max(3, math.ceil(_AGREEING * self.window_count))
-        if self.lines.size < minimum:
+        if self.rows.size < minimum:
             return None
-        offset = self.lines - line
-        first, second = index_pairs(self.lines.size)
-        slope = median((self.values[second] - self.values[first]) / (self.lines[second] - self.lines[first]))
+        offset = self.rows - row
+        first, second = index_pairs(self.rows.size)
+        slope = median((self.values[second] - self.values[first]) / (self.rows[second] - self.rows[first]))
         rest = self.values - slope * offset
         middle = median(rest)
         spread = max(1.4826 * median(np.abs(rest - middle)), 0.05)
@@ -83,7 +83,7 @@ def to_grey_floats(image: np.ndarray) -> np.ndarray:
 def match_rows(
     left: np.ndarray,
     right: np.ndarray,
-    lines: np.ndarray,
+    rows: np.ndarray,
     edges: tuple[np.ndarray, np.ndarray],
     bounds: tuple[float, float],
     half_height: int = 8,
@@ -93,8 +93,8 @@ def match_rows(
     """Match windows along a stalk with known edges.
 
     Args:
-        left, right: Rectified greyscale images [H, W], uint8 or float32; only rows around ``lines`` are used.
-        lines: Integer centre row [N] of each window.
+        left, right: Rectified greyscale images [H, W], uint8 or float32; only rows around ``rows`` are used.
+        rows: Integer centre row [N] of each window.
         edges: Columns [N] of the stalk's left and right edge in each of these rows.
         bounds: Minimum and maximum disparity, pixels.
         half_height: Rows of a window above and below its centre row.
@@ -102,34 +102,34 @@ def match_rows(
         spread: Tolerance for vertical misalignment of the right image, rows up or down.
 
     Returns:
-        Disparities of the windows with a unique match, in the order of ``lines``. Windows outside the image or narrower than
+        Disparities of the windows with a unique match, in the order of ``rows``. Windows outside the image or narrower than
         six pixels are not matched.
     """
     wanted = [
         _Window(
-            line,
+            row,
             int(np.ceil(begin + 0.5 * (1.0 - core) * (end - begin))),
             int(np.floor(end - 0.5 * (1.0 - core) * (end - begin))) + 1,
         )
-        for line, begin, end in zip(np.asarray(lines, int), *edges)
+        for row, begin, end in zip(np.asarray(rows, int), *edges)
     ]
     wanted = [strip for strip in wanted if strip.is_inside(left.shape, half_height, spread)]
     # A few windows are searched over all disparities. If these agree, the others are searched near the expected disparity.
     first = sorted(set(np.linspace(0, len(wanted) - 1, min(_COARSE_WINDOWS, len(wanted))).round().astype(int)))
     limits = int(np.floor(bounds[0])), int(np.ceil(bounds[1]))
     matches = {place: _match_window(left, right, wanted[place], limits, half_height, spread) for place in first}
-    expected = _robust_line([(wanted[place].line, result[0]) for place, result in matches.items() if result is not None])
+    expected = _robust_line([(wanted[place].row, result[0]) for place, result in matches.items() if result is not None])
     for place, window in enumerate(wanted):
         if place in matches:
             continue
         within = limits
         if expected is not None:
-            middle = expected[0] + expected[1] * window.line
+            middle = expected[0] + expected[1] * window.row
             within = max(math.floor(middle) - _BESIDE, limits[0]), min(math.ceil(middle) + _BESIDE, limits[1])
         matches[place] = _match_window(left, right, window, within, half_height, spread) if within[0] < within[1] else None
-    values = [(float(wanted[place].line), *result) for place, result in sorted(matches.items()) if result is not None]
+    values = [(float(wanted[place].row), *result) for place, result in sorted(matches.items()) if result is not None]
     matched = np.array(values, float).reshape(-1, 3)
-    return StalkDisparity(matched[:, 0], matched[:, 1], matched[:, 2], len(lines))
+    return StalkDisparity(matched[:, 0], matched[:, 1], matched[:, 2], len(rows))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,11 +137,11 @@ class _Window:
     """Window of a stalk in the left image.
 
     Attributes:
-        line: Centre row.
+        row: Centre row.
         first, last: First column, and end of the columns (exclusive).
     """
 
-    line: int
+    row: int
     first: int
     last: int
 
@@ -154,7 +154,7 @@ class _Window:
             spread: Maximum vertical misalignment, rows.
         """
         reach = half_height + spread
-        tall = reach <= self.line and self.line + reach + 1 <= shape[0]
+        tall = reach <= self.row and self.row + reach + 1 <= shape[0]
         return tall and self.last - self.first >= 6 and self.first >= 0 and self.last <= shape[1]
 
 
@@ -170,7 +170,7 @@ def _match_window(
         half_height: Rows of the window above and below its centre.
         spread: Maximum vertical misalignment, rows.
     """
-    top, bottom = window.line - half_height, window.line + half_height + 1
+    top, bottom = window.row - half_height, window.row + half_height + 1
     begin, end = max(window.first - bounds[1] - 1, 0), min(window.last - bounds[0] + 1, right.shape[1])
     if end - begin < window.last - window.first + 2:
         return None
@@ -187,17 +187,17 @@ def _robust_line(matches: list[tuple[int, float]]) -> tuple[float, float] | None
     """
     if len(matches) < 3:
         return None
-    line, value = np.array(matches, float).T
-    first, second = index_pairs(len(line))
-    slope = median((value[second] - value[first]) / (line[second] - line[first]))
-    rest = value - slope * line
+    row, value = np.array(matches, float).T
+    first, second = index_pairs(len(row))
+    slope = median((value[second] - value[first]) / (row[second] - row[first]))
+    rest = value - slope * row
     offset = median(rest)
-    return (offset, slope) if (np.abs(rest - offset) < _SCATTER).sum() >= max(3, len(line) - 1) else None
+    return (offset, slope) if (np.abs(rest - offset) < _SCATTER).sum() >= max(3, len(row) - 1) else None
 
 
 def sample_rows(
     disparity: np.ndarray,
-    lines: np.ndarray,
+    rows: np.ndarray,
     edges: tuple[np.ndarray, np.ndarray],
     bounds: tuple[float, float],
     core: float = 0.7,
@@ -208,23 +208,23 @@ def sample_rows(
 
     Args:
         disparity: [H, W] float32, pixels; NaN where unknown.
-        lines: Integer image rows [N].
+        rows: Integer image rows [N].
         edges: Columns [N] of the stalk's left and right edge in each of these rows.
         bounds: Minimum and maximum disparity, pixels.
         core: Central fraction of the stalk's width that is used.
     """
     samples = []
-    for line, begin, end in zip(np.asarray(lines, int), *edges):
+    for row, begin, end in zip(np.asarray(rows, int), *edges):
         margin = 0.5 * (1.0 - core) * (end - begin)
         first, last = max(int(np.ceil(begin + margin)), 0), int(np.floor(end - margin)) + 1
-        if not 0 <= line < disparity.shape[0] or last <= first:
+        if not 0 <= row < disparity.shape[0] or last <= first:
             continue
-        values = disparity[line, first:last]
+        values = disparity[row, first:last]
         values = values[(values >= bounds[0]) & (values <= bounds[1])]  # false for NaN
         if 2 * values.size >= last - first:
-            samples.append((float(line), float(np.median(values))))
+            samples.append((float(row), float(np.median(values))))
     columns = np.array(samples, float).reshape(-1, 2)
-    return StalkDisparity(columns[:, 0], columns[:, 1], np.ones(len(columns)), len(lines))
+    return StalkDisparity(columns[:, 0], columns[:, 1], np.ones(len(columns)), len(rows))
 
 
 def _subpixel_peak(score: np.ndarray) -> tuple[float, float] | None:

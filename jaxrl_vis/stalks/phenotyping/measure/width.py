@@ -20,7 +20,7 @@ EllipseFit = Literal["pixels", "pixels_direct", "contour", "contour_direct", "co
 ELLIPSE_FITS: tuple[EllipseFit, ...] = ("pixels", "pixels_direct", "contour", "contour_direct", "contour_ams", "moments")
 """Methods of fitting an ellipse to a blob. ``pixels``, least squares over all its pixels, is the method of the thesis."""
 
-_MIN_LINES = 8
+_MIN_ROWS = 8
 _CONVERGED = 1e-3  # change of weights below which the robust fit has converged
 _MAX_EDGE_OFFSET = 0.12  # of the width: maximum distance of a local edge from the edge fitted to the whole stalk
 _OUTLIER_DISTANCE = 1.5  # pixels: maximum distance of an edge from the mode of its neighbours
@@ -58,21 +58,21 @@ class Strip:
         """Angle between the axis and the vertical of the image, rad; positive if the stalk leans to the right."""
         return -math.atan(0.5 * (self.left[1] + self.right[1]))
 
-    def edges(self, line: float | None = None) -> tuple[float, float]:
+    def edges(self, row: float | None = None) -> tuple[float, float]:
         """Return the columns of the left and right edges in a row; in the reference row if None."""
-        offset = 0.0 if line is None else line - self.reference
+        offset = 0.0 if row is None else row - self.reference
         return self.left[0] + self.left[1] * offset, self.right[0] + self.right[1] * offset
 
-    def width(self, line: float | None = None) -> float:
+    def width(self, row: float | None = None) -> float:
         """Return the width in pixels, perpendicular to the axis where it crosses a row; at the reference row if None."""
-        left, right = self.edges(line)
+        left, right = self.edges(row)
         return (right - left) * math.cos(self.lean)
 
     @property
     def confidence(self) -> float:
         """Confidence from 0 to 1: the fraction of inlier rows, reduced if these are few or scattered."""
-        lines = self.last - self.first + 1
-        enough = min(lines / (2.0 * max(self.width(), 1.0)), 1.0)
+        rows = self.last - self.first + 1
+        enough = min(rows / (2.0 * max(self.width(), 1.0)), 1.0)
         return self.used * enough / (1.0 + (self.residual / 1.5) ** 2)
 
 
@@ -92,23 +92,23 @@ def row_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np.
     padded = np.zeros((inside.shape[0], inside.shape[1] + 2), np.int8)
     padded[:, 1:-1] = inside
     change = np.diff(padded, axis=1)
-    line, start = np.nonzero(change == 1)
+    row, start = np.nonzero(change == 1)
     _, end = np.nonzero(change == -1)  # one past the last column of the run
-    if not line.size:
+    if not row.size:
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
     # The longest run of each row; the first one in case of ties.
-    order = np.lexsort((start, start - end, line))
-    first = np.concatenate([[True], np.diff(line[order]) > 0])
-    line, start, end = (array[order][first] for array in (line, start, end))
+    order = np.lexsort((start, start - end, row))
+    first = np.concatenate([[True], np.diff(row[order]) > 0])
+    row, start, end = (array[order][first] for array in (row, start, end))
     complete = (start > 0) & (end < soft.shape[1])
-    line, start, end = line[complete], start[complete], end[complete]
+    row, start, end = row[complete], start[complete], end[complete]
 
     def crossing(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
         """Return the position between the inner and the outer pixel at which the mask crosses the threshold, 0 to 1."""
-        out, within = soft[line, outer], soft[line, inner]
+        out, within = soft[row, outer], soft[row, inner]
         return np.where(within > out, (within - threshold) / np.maximum(within - out, 1e-6), 0.5)
 
-    return line, start - crossing(start - 1, start), end - 1 + crossing(end, end - 1)
+    return row, start - crossing(start - 1, start), end - 1 + crossing(end, end - 1)
 
 
 def fit_strip(mask: np.ndarray, threshold: float = 0.5) -> Strip | None:
@@ -128,40 +128,40 @@ def fit_strip(mask: np.ndarray, threshold: float = 0.5) -> Strip | None:
     return fit_edges(*row_edges(mask, threshold))
 
 
-def fit_strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | None:
+def fit_strip_near(strip: Strip, row: float, reach: float, height: int) -> Strip | None:
     """Fit the edges of a stalk locally around a row, so that sheaths elsewhere have no effect.
 
     Slopes are those of the whole strip, which are determined by many more rows.
 
     Args:
         strip: Strip of the whole mask.
-        line: Row of the mask.
+        row: Row of the mask.
         reach: Distance above and below the row within which edges are used, pixels.
-        lines: Height of the mask.
+        height: Height of the mask.
 
     Returns:
-        Local strip; None if fewer than half of the rows (or eight) are inliers, these do not enclose ``line``, or they are
+        Local strip; None if fewer than half of the rows (or eight) are inliers, these do not enclose ``row``, or they are
         inconsistent with the rest of the stalk.
     """
-    first, last = max(math.floor(line - reach), 0), min(math.ceil(line + reach) + 1, lines)
-    if last - first < _MIN_LINES:
+    first, last = max(math.floor(row - reach), 0), min(math.ceil(row + reach) + 1, height)
+    if last - first < _MIN_ROWS:
         return None
     begin, end = np.searchsorted(strip.points[0], (first, last))
     place, left, right = (array[begin:end] for array in strip.points)
     offset = place - strip.reference
     residuals = [edge - fit[0] - fit[1] * offset for edge, fit in zip((left, right), (strip.left, strip.right))]
-    tolerance = max(3.0, _MAX_EDGE_OFFSET * strip.width(line))
+    tolerance = max(3.0, _MAX_EDGE_OFFSET * strip.width(row))
     good = np.logical_and(*(np.abs(offsets) < tolerance for offsets in residuals))
     for offsets in residuals:
         good &= np.abs(offsets - _mode(offsets[good])) < _OUTLIER_DISTANCE if good.any() else False
     count = int(good.sum())
-    if count < max(_MIN_LINES, 0.5 * (last - first)) or not place[good].min() <= line <= place[good].max():
+    if count < max(_MIN_ROWS, 0.5 * (last - first)) or not place[good].min() <= row <= place[good].max():
         return None
     moved = [float(offsets[good].mean()) for offsets in residuals]
     rms = float(np.sqrt(np.mean([np.var(offsets[good]) for offsets in residuals])))
-    edges = [(edge + shift, fit[1]) for edge, shift, fit in zip(strip.edges(line), moved, (strip.left, strip.right))]
+    edges = [(edge + shift, fit[1]) for edge, shift, fit in zip(strip.edges(row), moved, (strip.left, strip.right))]
     return Strip(
-        reference=line,
+        reference=row,
         left=edges[0],
         right=edges[1],
         first=int(place[good].min()),
@@ -178,31 +178,31 @@ def _deviation(rms: float, count: int) -> float:
     return math.sqrt(2.0) * max(rms, 0.05) / math.sqrt(count)
 
 
-def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | None:
+def fit_edges(rows: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | None:
     """Fit robust straight lines to edges found row by row.
 
     Args:
-        line: Rows [N], in ascending order.
+        rows: Rows [N], in ascending order.
         left, right: Columns [N] float64 of the edges.
 
     Returns:
         Fitted strip; None if there are fewer than eight inlier rows.
     """
-    if line.size < _MIN_LINES:
+    if rows.size < _MIN_ROWS:
         return None
-    points, total = (line, left, right), line.size
-    slope = _common_slope(line, left, right)
+    points, total = (rows, left, right), rows.size
+    slope = _common_slope(rows, left, right)
     # Near the ends of a strip that is cut perpendicular to its axis, one of the edges in a row belongs to the cut. These rows
     # lie within the projected width of the first and last row.
     wide = median(right - left)
     cut = math.ceil(wide * abs(slope) / (1.0 + slope**2)) if abs(slope) > 0.01 else 0
-    inner = (line >= line[0] + cut) & (line <= line[-1] - cut)
-    if inner.sum() >= _MIN_LINES:
-        line, left, right = line[inner], left[inner], right[inner]
-        total = line.size
-    reference = float(line.mean())
-    offset = line - reference
-    good = np.ones(line.size, bool)
+    inner = (rows >= rows[0] + cut) & (rows <= rows[-1] - cut)
+    if inner.sum() >= _MIN_ROWS:
+        rows, left, right = rows[inner], left[inner], right[inner]
+        total = rows.size
+    reference = float(rows.mean())
+    offset = rows - reference
+    good = np.ones(rows.size, bool)
     lines: list[tuple[float, float]] = []
     scale = _NOISE
     for edge in (left, right):
@@ -210,7 +210,7 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
         weight = (np.abs(edge - slope * offset - start) < max(3.0, 0.08 * wide)).astype(float)
         for _ in range(12):
             heavy = weight > 0
-            if np.count_nonzero(heavy) < _MIN_LINES:
+            if np.count_nonzero(heavy) < _MIN_ROWS:
                 return None
             fitted = _fit_line(offset, edge, weight)
             residual = edge - fitted[0] - fitted[1] * offset
@@ -222,7 +222,7 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
         good &= weight > 0
         lines.append(fitted)
         scale = max(scale, spread)
-    if good.sum() < _MIN_LINES:
+    if good.sum() < _MIN_ROWS:
         return None
     # Use the same rows for both edges, so that an occlusion of one edge tilts neither.
     fits = [_fit_line(offset, edge, good.astype(float)) for edge in (left, right)]
@@ -232,8 +232,8 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
         reference=reference,
         left=fits[0],
         right=fits[1],
-        first=int(line[good].min()),
-        last=int(line[good].max()),
+        first=int(rows[good].min()),
+        last=int(rows[good].max()),
         used=float(good.sum()) / total,
         residual=rms,
         deviation=_deviation(rms, int(good.sum())),
@@ -241,18 +241,18 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
     )
 
 
-def _common_slope(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> float:
+def _common_slope(rows: np.ndarray, left: np.ndarray, right: np.ndarray) -> float:
     """Estimate the common slope of both edges, columns per row: the mode over pairs of edge points.
 
     Args:
-        line: Rows [N], in ascending order.
+        rows: Rows [N], in ascending order.
         left, right: Columns [N] of the edges in these rows, pixels.
     """
-    step = max(line.size // 60, 1)
-    places = np.arange(0, line.size, step)
+    step = max(rows.size // 60, 1)
+    places = np.arange(0, rows.size, step)
     first, second = index_pairs(places.size, max(places.size // 4, 1))
     first, second = places[first], places[second]
-    gap = (line[second] - line[first]).astype(float)
+    gap = (rows[second] - rows[first]).astype(float)
     slopes = np.concatenate([(edge[second] - edge[first]) / gap for edge in (left, right)])
     return _mode(slopes, 0.02)
 
@@ -313,8 +313,8 @@ def ellipse_width(mask: np.ndarray, fit: EllipseFit = "pixels") -> float | None:
 
 
 def _minor_axis(blob: np.ndarray, fit: EllipseFit) -> float | None:
-    line, column = np.nonzero(blob)
-    pixels = np.stack([column, line], axis=1).astype(np.float32)
+    row, column = np.nonzero(blob)
+    pixels = np.stack([column, row], axis=1).astype(np.float32)
     if fit == "moments":
         return 4.0 * math.sqrt(max(float(np.linalg.eigvalsh(np.cov(pixels.T))[0]), 0.0))
     if fit.startswith("contour"):

@@ -48,8 +48,8 @@ def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str 
 def _draw_outline(canvas: np.ndarray, sighting: Sighting, colour: tuple[int, int, int], scale: float, thickness: int) -> None:
     """Draw the two edges of a stalk in the band, and bars where its widths were measured."""
 
-    def at(column: float, line: float) -> tuple[int, int]:
-        return round((column + 0.5) * scale - 0.5), round((line + 0.5) * scale - 0.5)
+    def at(column: float, row: float) -> tuple[int, int]:
+        return round((column + 0.5) * scale - 0.5), round((row + 0.5) * scale - 0.5)
 
     left, top, right, bottom = sighting.box
     lean = math.radians(sighting.lean_deg or 0.0)
@@ -61,14 +61,14 @@ def _draw_outline(canvas: np.ndarray, sighting: Sighting, colour: tuple[int, int
     )
     slope = (sighting.axis[1] - sighting.axis[0]) / max(bottom - top, 1.0)
     # The outline passes through the measured centre.
-    middle = [sighting.column + slope * (line - sighting.line) for line in (top, bottom)]
+    middle = [sighting.column + slope * (row - sighting.row) for row in (top, bottom)]
     for side in (-half, half):
         cv2.line(canvas, at(middle[0] + side, top), at(middle[1] + side, bottom), colour, thickness, cv2.LINE_AA)
-    bars = [(sighting.column, sighting.line, sighting.width_px)] if sighting.diameter_mm is not None else []
-    for column, line, width in [*bars, *([sighting.upper_place] if sighting.upper_place else [])]:
+    bars = [(sighting.column, sighting.row, sighting.width_px)] if sighting.diameter_mm is not None else []
+    for column, row, width in [*bars, *([sighting.upper_place] if sighting.upper_place else [])]:
         reach = 0.5 * (width or 0.0)
         over, down = reach * math.cos(lean), reach * math.sin(lean)
-        cv2.line(canvas, at(column - over, line - down), at(column + over, line + down), MEASURED, 2 * thickness, cv2.LINE_AA)
+        cv2.line(canvas, at(column - over, row - down), at(column + over, row + down), MEASURED, 2 * thickness, cv2.LINE_AA)
 
 
 class _LabelWriter:

@@ -22,14 +22,14 @@ def outline(detection: Detection) -> list[float]:
     the box.
     """
     left, top, right, bottom = (edge + 0.5 for edge in detection.box)
-    lines = np.arange(detection.mask.shape[0]) + detection.corner[0] + 0.5
-    mask = (np.asarray(detection.mask, float) >= 0.5) & ((lines >= top) & (lines <= bottom))[:, None]
+    y = np.arange(detection.mask.shape[0]) + detection.corner[0] + 0.5
+    mask = (np.asarray(detection.mask, float) >= 0.5) & ((y >= top) & (y <= bottom))[:, None]
     rows = np.flatnonzero(mask.any(axis=1))
     if rows.size < 2:
         return [left, top, right, top, right, bottom, left, bottom]
     first = mask[rows].argmax(axis=1) + detection.corner[1]
     last = mask.shape[1] - mask[rows][:, ::-1].argmax(axis=1) + detection.corner[1]
-    sides = [_simplify_outline(np.stack([side, lines[rows]], axis=1)) for side in (first, last)]
+    sides = [_simplify_outline(np.stack([side, y[rows]], axis=1)) for side in (first, last)]
     # Use the outer corners of the first and the last pixels instead of their centres.
     for side in sides:
         side[0, 1] -= 0.5

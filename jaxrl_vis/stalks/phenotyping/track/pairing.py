@@ -59,17 +59,17 @@ def pair_fault(
     ]
     if _measured_fraction(turned, grey_left[:, ::-1], grey_right[:, ::-1], mirror) >= _LARGE_FRACTION:
         return "left and right are swapped: exchange their names"
-    for lines in sorted({max(round(line * calibration.focal / 2168), 3) for line in _ROW_OFFSETS}):
-        for shift in (lines, -lines):
+    for rows in sorted({max(round(offset * calibration.focal / 2168), 3) for offset in _ROW_OFFSETS}):
+        for shift in (rows, -rows):
             if _measured_fraction(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _LARGE_FRACTION:
-                return f"the right image lies about {lines} lines too {'high' if shift > 0 else 'low'}: rectify the pair"
+                return f"the right image lies about {rows} lines too {'high' if shift > 0 else 'low'}: rectify the pair"
     return None
 
 
 def _orientation_fault(left: np.ndarray, right: np.ndarray, calibration: Calibration) -> str | None:
     """Return a message if a greyscale pair [H, W] is upside down; None if not."""
-    column, line = calibration.centre
-    turned = dataclasses.replace(calibration, centre=(column, calibration.height - 1 - line))
+    column, row = calibration.centre
+    turned = dataclasses.replace(calibration, centre=(column, calibration.height - 1 - row))
     if find_ground(left[::-1], right[::-1], turned) is not None:
         return "the images are upside down, left and right exchanged: turn both by 180 degrees, and exchange their names back"
     turned = dataclasses.replace(turned, centre=(calibration.width - 1 - column, turned.centre[1]))

@@ -13,7 +13,7 @@ import numpy as np
 from jaxrl_vis.config import fields
 from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, find_frame
-from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_lines, find_ground
+from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_rows, find_ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement, Method, measure_stalk
 from jaxrl_vis.stalks.phenotyping.measure.width import fit_strip
 from jaxrl_vis_envs.plants import Calibration
@@ -44,7 +44,7 @@ class Sighting:
             pixel.
         axis: x coordinates of its centre line at the top and bottom of the box, pixels.
         score: Score of the detector, 0 to 1.
-        line, column: Image row of the measurement, and column of the stalk's centre line in it, pixels.
+        row, column: Image row of the measurement, and column of the stalk's centre line in it, pixels.
         width_px: Width perpendicular to the axis, pixels.
         lean_deg: Angle against the vertical of the image, degrees, positive to the right.
         diameter_mm: Diameter perpendicular to the axis, mm.
@@ -65,7 +65,7 @@ class Sighting:
     box: tuple[float, float, float, float]
     axis: tuple[float, float]
     score: float
-    line: float
+    row: float
     column: float
     width_px: float | None = None
     lean_deg: float | None = None
@@ -103,7 +103,7 @@ class Sighting:
             several = value if isinstance(value, tuple) else (value,)
             if len(several) != length or not all(isinstance(value, kind) for value in several):
                 raise ValueError(f"{name} is not of its kind")
-        if len(parts) != len(values) or not {"box", "axis", "score", "line", "column"} <= parts.keys():
+        if len(parts) != len(values) or not {"box", "axis", "score", "row", "column"} <= parts.keys():
             raise ValueError("something is missing or too many")
         return cls(**parts)
 
@@ -113,7 +113,7 @@ class Sighting:
 
 
 # Keys in files of the fields that have another name there.
-_KEYS = {"occluded": "hidden", "upper_occluded": "upper_hidden"}
+_KEYS = {"row": "line", "occluded": "hidden", "upper_occluded": "upper_hidden"}
 
 
 def _field_kind(hint: Any) -> tuple[type | tuple[type, ...], bool, int]:
@@ -157,7 +157,7 @@ def detect_with_ground(
         ground = aside.submit(lambda: find_ground(to_grey_bytes(left), to_grey_bytes(right), calibration, disparity))
 
         def band(column: float) -> tuple[float, float]:  # waits for the ground, but not before a detector asks
-            return band_lines(ground.result(), calibration, distance, column)
+            return band_rows(ground.result(), calibration, distance, column)
 
         return find(left, calibration.focal / distance, band), ground.result()
 
@@ -212,7 +212,7 @@ def view_pair(
     if there is None and len(detections) >= _AT_DISTANCE:
         return usual
     for distance in _OTHER_DISTANCES if there is None else (there,):
-        band = functools.partial(band_lines, ground, calibration, distance)
+        band = functools.partial(band_rows, ground, calibration, distance)
         detections = find(left, calibration.focal / distance, band)
         sightings = measure_pair(detections, left, right, calibration, method, ground, disparity)
         there = row_distance(sightings)
@@ -254,11 +254,11 @@ def measure_pair(
     grey_left, grey_right = to_grey_bytes(left), to_grey_bytes(right)
     measured: list[tuple[Measurement, Measurement | None]] = []
     for detection in detections:
-        line = 0.5 * (detection.box[1] + detection.box[3])
+        row = 0.5 * (detection.box[1] + detection.box[3])
         images = (grey_left, grey_right, calibration)
         how = {"method": method, "ground": ground, "disparity": disparity}
         measurement = measure_stalk(
-            detection.mask, detection.corner, *images, line=line, height=HEIGHTS[0], strip=detection.strip, **how
+            detection.mask, detection.corner, *images, row=row, height=HEIGHTS[0], strip=detection.strip, **how
         )
         upper = None
         if ground is not None and detection.upper is not None:
@@ -293,14 +293,14 @@ def _without_mismatches(
     depths = [measurement.depth for measurement, _ in measured if measurement.diameter_mm is not None]
     if len(depths) < _AT_DISTANCE:
         return measured
-    row = float(np.median(depths))
-    disparity = float(calibration.disparity(np.array(row)))
+    row_depth = float(np.median(depths))
+    disparity = float(calibration.disparity(np.array(row_depth)))
     valid = []
     for measurement, upper in measured:
         beyond = measurement.column - 0.5 * measurement.width - disparity < first_column
-        if measurement.diameter_mm is not None and beyond and abs(measurement.depth - row) > _FAR_FROM_ROW:
+        if measurement.diameter_mm is not None and beyond and abs(measurement.depth - row_depth) > _FAR_FROM_ROW:
             measurement = Measurement(
-                line=measurement.line,
+                row=measurement.row,
                 column=measurement.column,
                 lean=measurement.lean,
                 reason="the right image does not show it",
@@ -327,7 +327,7 @@ def _occluded_edges(measurements: list[Measurement]) -> list[bool]:
                 or other.depth > measurement.depth + _BEHIND
             ):
                 continue
-            middle = other.column + math.tan(other.lean) * (other.line - measurement.line)
+            middle = other.column + math.tan(other.lean) * (other.row - measurement.row)
             reach = 0.5 * other.width / math.cos(other.lean) + _TOUCHING * half
             occluded[-1] |= any(abs(measurement.column + side * half - middle) < reach for side in (-1.0, 1.0))
     return occluded
@@ -335,16 +335,16 @@ def _occluded_edges(measurements: list[Measurement]) -> list[bool]:
 
 def _unscaled_sighting(detection: Detection) -> Sighting:
     strip = detection.strip or fit_strip(detection.mask)
-    line = 0.5 * (detection.box[1] + detection.box[3])
+    row = 0.5 * (detection.box[1] + detection.box[3])
     column = 0.5 * sum(detection.axis)
     if strip is None:
-        return Sighting(detection.box, detection.axis, detection.score, line, column, reason=NO_CALIBRATION)
-    width, lean = strip.width(line - detection.corner[0]), math.degrees(strip.lean)
+        return Sighting(detection.box, detection.axis, detection.score, row, column, reason=NO_CALIBRATION)
+    width, lean = strip.width(row - detection.corner[0]), math.degrees(strip.lean)
     return Sighting(
         detection.box,
         detection.axis,
         detection.score,
-        line,
+        row,
         column,
         round(width, 3),
         round(lean, 2),
@@ -357,7 +357,7 @@ def _make_sighting(
     detection: Detection, measurement: Measurement, upper: Measurement | None, calibration: Calibration
 ) -> Sighting:
     """Build a sighting from measurements, rounded so that it is unchanged by a round trip through JSON."""
-    line = measurement.line if math.isfinite(measurement.line) else 0.5 * (detection.box[1] + detection.box[3])
+    row = measurement.row if math.isfinite(measurement.row) else 0.5 * (detection.box[1] + detection.box[3])
     column = measurement.column if math.isfinite(measurement.column) else 0.5 * sum(detection.axis)
 
     def round_or_none(value: float | None, digits: int) -> float | None:
@@ -375,7 +375,7 @@ def _make_sighting(
         box=tuple(round(edge, 2) for edge in detection.box),  # pyright: ignore[reportArgumentType]
         axis=tuple(round(column, 2) for column in detection.axis),  # pyright: ignore[reportArgumentType]
         score=round(detection.score, 4),
-        line=round(line, 2),
+        row=round(row, 2),
         column=round(column, 2),
         width_px=round_or_none(measurement.width, 3),
         lean_deg=round_or_none(math.degrees(measurement.lean), 2),
@@ -390,7 +390,7 @@ def _make_sighting(
         upper_confidence=round(higher.confidence, 4),
         upper_place=None
         if higher.diameter_mm is None
-        else tuple(round(x, 2) for x in (higher.column, higher.line, higher.width)),  # pyright: ignore[reportArgumentType]
+        else tuple(round(x, 2) for x in (higher.column, higher.row, higher.width)),  # pyright: ignore[reportArgumentType]
         confidence=round(measurement.confidence, 4),
         ray_deg=round(math.degrees(math.atan((column - calibration.centre[0]) / calibration.focal)), 2),
         reason=measurement.reason,

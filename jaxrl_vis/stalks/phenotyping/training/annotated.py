@@ -208,9 +208,9 @@ def _annotated_stalk(annotation: dict[str, Any], size: tuple[int, int]) -> list[
     """Return the box and axis [6] of one annotation; the axis is fitted to its mask, and vertical if that is small."""
     left, top, wide, tall = annotation["bbox"]
     right, bottom = left + wide, top + tall
-    line, column = np.nonzero(_annotated_mask(annotation, size))
+    row, column = np.nonzero(_annotated_mask(annotation, size))
     axis = [left + wide / 2] * 2
-    if line.size > 50 and np.ptp(line) > 8:
-        slope, offset = np.polyfit(line + 0.5, column + 0.5, 1)
+    if row.size > 50 and np.ptp(row) > 8:
+        slope, offset = np.polyfit(row + 0.5, column + 0.5, 1)
         axis = [float(np.clip(offset + slope * edge, left, right)) for edge in (top, bottom)]
     return [left, top, right, bottom, *axis]

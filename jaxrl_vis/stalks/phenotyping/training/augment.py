@@ -80,9 +80,9 @@ def _transform_stalks(image: jax.Array, stalks: jax.Array, kinds: jax.Array, sha
     over, down = jnp.where(still, 0.0, 0.04 * width * drawn[4]), jnp.where(still, 0.0, 0.04 * height * drawn[5])
     mirror = drawn[6] > 0.0
     # x' = wide (x - w/2) + shear (y - h/2) + w/2 + over, and then mirrored; y' = tall (y - h/2) + h/2 + down.
-    line, column = jnp.meshgrid(jnp.arange(image.shape[0]) + 0.5, jnp.arange(image.shape[1]) + 0.5, indexing="ij")
+    row, column = jnp.meshgrid(jnp.arange(image.shape[0]) + 0.5, jnp.arange(image.shape[1]) + 0.5, indexing="ij")
     column = jnp.where(mirror, width - column, column)
-    y = (line - down - height / 2) / tall + height / 2
+    y = (row - down - height / 2) / tall + height / 2
     x = (column - over - width / 2 - shear * (y - height / 2)) / wide + width / 2
     moved = _sample(image, y - 0.5, x - 0.5, shape)
 
@@ -113,11 +113,9 @@ def _transform_stalks(image: jax.Array, stalks: jax.Array, kinds: jax.Array, sha
     return moved, jnp.stack([begin, low, end, high, above, below], axis=-1), kinds
 
 
-def _edges_at(
-    edges: jax.Array, lines: jax.Array, height: jax.Array, width: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Interpolate edges [T, R, 3] at rows ``lines`` [K] of an image; return left, right and visible fraction, each [T, K]."""
-    place = jnp.clip(lines / STEP - 0.5, 0.0, edges.shape[1] - 1.0)
+def _edges_at(edges: jax.Array, rows: jax.Array, height: jax.Array, width: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Interpolate edges [T, R, 3] at ``rows`` [K] of an image; return left, right and visible fraction, each [T, K]."""
+    place = jnp.clip(rows / STEP - 0.5, 0.0, edges.shape[1] - 1.0)
     first = jnp.minimum(jnp.floor(place).astype(jnp.int32), edges.shape[1] - 2)
     part = (place - first)[:, None]
     left, right = jnp.moveaxis((edges[:, first] * (1.0 - part) + edges[:, first + 1] * part)[..., :2], -1, 0)
@@ -126,18 +124,18 @@ def _edges_at(
     inside = jnp.clip(jnp.minimum(right, width) - jnp.maximum(left, 0.0), 0.0, None) / jnp.maximum(right - left, 1e-3)
     partly = jnp.where(inside > 0.0, jnp.minimum(visible, UNKNOWN), ABSENT)
     visible = jnp.where(inside >= WHOLE, visible, partly)
-    return left, right, jnp.where((lines >= 0.0) & (lines < height), visible, ABSENT)
+    return left, right, jnp.where((rows >= 0.0) & (rows < height), visible, ABSENT)
 
 
-def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: jax.Array) -> jax.Array:
-    """Sample an image [H, W, 3] uint8 at rows ``line`` and columns ``column`` [h, w] by bilinear interpolation.
+def _sample(image: jax.Array, row: jax.Array, column: jax.Array, shape: jax.Array) -> jax.Array:
+    """Sample an image [H, W, 3] uint8 at ``row`` and ``column`` [h, w] by bilinear interpolation.
 
     Pixels outside ``shape`` [2], the height and width of the image without padding, are black.
     """
-    inside = (line >= -0.5) & (line <= shape[0] - 0.5) & (column >= -0.5) & (column <= shape[1] - 0.5)
-    line, column = jnp.clip(line, 0.0, shape[0] - 1.0), jnp.clip(column, 0.0, shape[1] - 1.0)
-    top, left = jnp.floor(line).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)
-    down, over = (line - top)[..., None], (column - left)[..., None]
+    inside = (row >= -0.5) & (row <= shape[0] - 0.5) & (column >= -0.5) & (column <= shape[1] - 0.5)
+    row, column = jnp.clip(row, 0.0, shape[0] - 1.0), jnp.clip(column, 0.0, shape[1] - 1.0)
+    top, left = jnp.floor(row).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)
+    down, over = (row - top)[..., None], (column - left)[..., None]
     below, right = jnp.minimum(top + 1, shape[0] - 1), jnp.minimum(left + 1, shape[1] - 1)
     values = image.astype(jnp.float32)
     upper = values[top, left] * (1 - over) + values[top, right] * over
@@ -188,8 +186,8 @@ def _add_texture(crops: jax.Array, key: jax.Array) -> jax.Array:
     spots, fibres, shades, amounts = jax.random.split(key, 4)
     amount = jax.random.uniform(amounts, (4, count, 1, 1))
 
-    def noise(key: jax.Array, lines: int, columns: int) -> jax.Array:
-        shape = (count, max(height // lines, 1), max(width // columns, 1))
+    def noise(key: jax.Array, rows: int, columns: int) -> jax.Array:
+        shape = (count, max(height // rows, 1), max(width // columns, 1))
         return jax.image.resize(jax.random.normal(key, shape), (count, height, width), "linear")
 
     dark = jnp.where(noise(spots, 6, 3) > 2.2 - 1.4 * amount[0], 1.0 - 0.6 * amount[1], 1.0)
@@ -214,7 +212,7 @@ def _add_stripes(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Arra
     keys = jax.random.split(key, 5)
     # Index of the internode, out of four, that each row belongs to.
     nodes = jnp.sort(jax.random.uniform(keys[0], (3, count)), axis=0) * height
-    internode = (jnp.arange(height) > nodes[..., None]).sum(axis=0)  # [N, lines]
+    internode = (jnp.arange(height) > nodes[..., None]).sum(axis=0)  # [N, H]
     stripes = jnp.zeros(masks.shape)
     weights = jax.nn.softmax(2.0 * jax.random.normal(keys[1], (2, count)), axis=0)
     for index, (columns, weight) in enumerate(zip((5, 12), weights)):

@@ -44,23 +44,23 @@ def synthetic_edges(
     of_stalks = bins[:, None] * total + thinned
     counts = np.bincount(of_stalks[thinned >= 0], minlength=count * total).reshape(count, total)  # of pixels
     sampled = np.bincount(bins, minlength=count)  # rows
-    lines = (np.arange(count) + 0.5) * STEP * scale[0] - 0.5
+    image_rows = (np.arange(count) + 0.5) * STEP * scale[0] - 0.5
     pixel = thin * thin / (scale[0] * scale[1])  # of the resized image
     is_daytime = plot.family.scene.share > 0
     candidates: list[tuple[float, np.ndarray, int]] = []
     for number in np.flatnonzero(counts.any(axis=0)).tolist():
         amount = int(counts[:, number].sum())
-        row = plot.stalks[number].row
-        if row < 0 or (row > 0 and not is_daytime) or amount * pixel < _FEW:
+        plant_row = plot.stalks[number].row
+        if plant_row < 0 or (plant_row > 0 and not is_daytime) or amount * pixel < _FEW:
             continue
-        sides = _sides(plot.stalks[number], pose, camera, lines)
+        sides = _sides(plot.stalks[number], pose, camera, image_rows)
         if sides is None:
             continue
         left, right, there = sides
         room = sampled * np.maximum(right - left, 1.0) / thin
         visible = np.where(there, np.minimum(counts[:, number] / np.maximum(room, 1e-6), 1.0), ABSENT)
         columns = np.stack([(left + 0.5) / scale[1], (right + 0.5) / scale[1], visible], axis=-1).astype(np.float32)
-        kind = STALK if row == 0 else UNCLEAR
+        kind = STALK if plant_row == 0 else UNCLEAR
         candidates.append((amount * (1.0 if kind == STALK else 1e-6), columns, kind))
     candidates.sort(key=lambda candidate: -candidate[0])
     candidates = candidates[:MAX_EDGES]
@@ -68,10 +68,8 @@ def synthetic_edges(
     return edges, np.array([kind for _, _, kind in candidates], np.int32)
 
 
-def _sides(
-    stalk: Stalk, pose: Pose, camera: Calibration, lines: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return the left and right columns [R] of a stalk at image rows ``lines`` [R], and a mask [R] of the rows that it reaches.
+def _sides(stalk: Stalk, pose: Pose, camera: Calibration, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return the left and right columns [R] of a stalk at image ``rows`` [R], and a mask [R] of the rows that it reaches.
 
     Beyond its ends, columns are extrapolated. None if all of it is nearer than `_NEAR`, or less than two pixels tall.
     """
@@ -84,20 +82,20 @@ def _sides(
     middle = edges[:, :, 1].mean(axis=1)
     if np.ptp(middle) < 2.0:
         return None
-    left, right = (_interpolate(lines, edges[:, side, 1], edges[:, side, 0]) for side in (0, 1))
-    return left, right, (lines >= middle.min()) & (lines <= middle.max())
+    left, right = (_interpolate(rows, edges[:, side, 1], edges[:, side, 0]) for side in (0, 1))
+    return left, right, (rows >= middle.min()) & (rows <= middle.max())
 
 
-def _interpolate(lines: np.ndarray, at: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _interpolate(rows: np.ndarray, at: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Interpolate ``values`` at rows ``at`` linearly, and extrapolate them by the slope of their ends."""
     order = np.argsort(at)
     at, values = at[order], values[order]
     reach = max(len(at) // 20, 1)
-    inner = np.interp(lines, at, values)
+    inner = np.interp(rows, at, values)
     for end, other in ((0, reach), (-1, -1 - reach)):
         slope = (values[end] - values[other]) / (at[end] - at[other]) if at[end] != at[other] else 0.0
-        beyond = lines < at[0] if end == 0 else lines > at[-1]
-        inner = np.where(beyond, values[end] + slope * (lines - at[end]), inner)
+        beyond = rows < at[0] if end == 0 else rows > at[-1]
+        inner = np.where(beyond, values[end] + slope * (rows - at[end]), inner)
     return inner
 
 
@@ -111,10 +109,10 @@ def boxes_around_edges(edges: np.ndarray) -> np.ndarray:
     return boxes
 
 
-def cut_edges(edges: Edges, top: int, left: int, lines: int) -> Edges:
-    """Return the edges in a crop of ``lines`` rows that begins at row ``top``, a multiple of `STEP`, and column ``left``."""
+def cut_edges(edges: Edges, top: int, left: int, height: int) -> Edges:
+    """Return the edges in a crop of ``height`` rows that begins at row ``top``, a multiple of `STEP`, and column ``left``."""
     first = top // STEP
-    rows = edges[0][:, first : first + -(-lines // STEP)] - np.array([left, left, 0], np.float32)
+    rows = edges[0][:, first : first + -(-height // STEP)] - np.array([left, left, 0], np.float32)
     return rows, edges[1]
 
 
@@ -153,23 +151,23 @@ def annotated_edges(
         scale: Vertical and horizontal factors from coordinates of the resized image to those of the original.
     """
     count = -(-shape[0] // STEP)
-    lines = (np.arange(count) + 0.5) * STEP * scale[0]
+    rows = (np.arange(count) + 0.5) * STEP * scale[0]
     edges = np.zeros((min(len(stalks), MAX_EDGES), count, 3), np.float32)
-    for row, stalk, mask in zip(edges, stalks, masks):
+    for columns, stalk, mask in zip(edges, stalks, masks):
         box_left, top, box_right, bottom, above, below = stalk
         half = 0.5 * max(float(box_right - box_left - abs(below - above)), 1.0)
-        axis = above + (below - above) * (lines - top) / max(float(bottom - top), 1.0)
+        axis = above + (below - above) * (rows - top) / max(float(bottom - top), 1.0)
         left, right = axis - half, axis + half
-        there = (lines >= top) & (lines <= bottom)
+        there = (rows >= top) & (rows <= bottom)
         visible = np.where(there, 1.0, UNKNOWN)
         filled = None if mask is None else np.flatnonzero(mask.any(axis=1))
         if mask is not None and filled is not None and len(filled) > 1:
             first = mask.argmax(axis=1)[filled].astype(float)
             last = mask.shape[1] - mask[:, ::-1].argmax(axis=1)[filled].astype(float)
-            inside = (lines >= filled[0]) & (lines <= filled[-1] + 1)
-            left = np.where(inside, np.interp(lines, filled + 0.5, first), left)
-            right = np.where(inside, np.interp(lines, filled + 0.5, last), right)
-            shown = np.isin(lines.astype(int), filled)
+            inside = (rows >= filled[0]) & (rows <= filled[-1] + 1)
+            left = np.where(inside, np.interp(rows, filled + 0.5, first), left)
+            right = np.where(inside, np.interp(rows, filled + 0.5, last), right)
+            shown = np.isin(rows.astype(int), filled)
             visible = np.where(inside, np.where(shown, 1.0, 0.0), UNKNOWN)
-        row[:] = np.stack([left / scale[1], right / scale[1], visible], axis=-1)
+        columns[:] = np.stack([left / scale[1], right / scale[1], visible], axis=-1)
     return edges, np.asarray(kinds[:MAX_EDGES], np.int32)

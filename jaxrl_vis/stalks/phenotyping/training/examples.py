@@ -103,7 +103,7 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         if is_daytime:
             # Lenses and scales differ between plots, and each shape of crops would need a compilation.
             shape = crop_shape((settings.crop_height, settings.crop_width), family.rig.width / settings.full_width)
-            example = resize_crops(crop_randomly(example, (settings.lines, settings.width), rng), shape)
+            example = resize_crops(crop_randomly(example, (settings.height, settings.width), rng), shape)
         examples.append(example)
     return examples
 
@@ -133,40 +133,40 @@ def crop_randomly(example: Example, max_size: tuple[int, int], rng: np.random.Ge
         Example with clipped stalks; those that are hardly left in the image become ``NOTHING``.
     """
     size = example.image.shape[:2]
-    lines, columns = (min(length, limit) for length, limit in zip(size, max_size))
-    low, high = np.zeros(2, int), np.array([size[0] - lines, size[1] - columns])
+    rows, columns = (min(length, limit) for length, limit in zip(size, max_size))
+    low, high = np.zeros(2, int), np.array([size[0] - rows, size[1] - columns])
     boxes = example.stalks if example.edges is None else boxes_around_edges(example.edges[0])
     there = np.flatnonzero((example.kinds if example.edges is None else example.edges[1]) == STALK)
     if len(there) and rng.random() < _AT_STALKS:
         box = boxes[rng.choice(there)]
         middle = np.array([box[1] + box[3], box[0] + box[2]]) / 2
         low, high = (
-            np.clip(middle - 0.9 * np.array([lines, columns]), 0, high),
-            np.clip(middle - [0.1 * lines, 0.1 * columns], 0, high),
+            np.clip(middle - 0.9 * np.array([rows, columns]), 0, high),
+            np.clip(middle - [0.1 * rows, 0.1 * columns], 0, high),
         )
     top, left = (int(rng.integers(int(first), int(last) + 1)) for first, last in zip(low, high))
     if example.edges is not None:
         top = top // STEP * STEP  # edges are those of every eighth row
     stalks = example.stalks - np.array([left, top, left, top, left, left], np.float32)
-    inside = np.array([[lines, columns]]) > np.maximum(stalks[:, [1, 0]], 0.0)
-    shown = (np.minimum(stalks[:, [3, 2]], [lines, columns]) - np.maximum(stalks[:, [1, 0]], 0.0) > [16.0, 3.0]) & inside
+    inside = np.array([[rows, columns]]) > np.maximum(stalks[:, [1, 0]], 0.0)
+    shown = (np.minimum(stalks[:, [3, 2]], [rows, columns]) - np.maximum(stalks[:, [1, 0]], 0.0) > [16.0, 3.0]) & inside
     there = shown.all(axis=1) & (example.kinds != NOTHING)
     kinds = np.where(there, example.kinds, NOTHING)
-    image = example.image[top : top + lines, left : left + columns]
+    image = example.image[top : top + rows, left : left + columns]
     return dataclasses.replace(
         example,
         image=np.ascontiguousarray(image),
-        stalks=_clip_stalks(stalks, lines, columns),
+        stalks=_clip_stalks(stalks, rows, columns),
         kinds=kinds,
-        edges=None if example.edges is None else cut_edges(example.edges, top, left, lines),
+        edges=None if example.edges is None else cut_edges(example.edges, top, left, rows),
     )
 
 
-def _clip_stalks(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
-    """Clip the boxes of stalks [T, 6] to an image of ``lines`` x ``columns`` pixels, and their axes to the clipped boxes."""
+def _clip_stalks(stalks: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Clip the boxes of stalks [T, 6] to an image of ``rows`` x ``columns`` pixels, and their axes to the clipped boxes."""
     left, top, right, bottom, above, below = stalks.T
     slope = (below - above) / np.maximum(bottom - top, 1e-3)
-    first, last = np.clip(top, 0, lines), np.clip(bottom, 0, lines)
+    first, last = np.clip(top, 0, rows), np.clip(bottom, 0, rows)
     axis = above + slope * (first - top), below + slope * (last - bottom)
     return np.stack([np.clip(left, 0, columns), first, np.clip(right, 0, columns), last, *axis], axis=1).astype(np.float32)
 

@@ -252,14 +252,14 @@ def _stack_crops(examples: list[Example]) -> tuple[np.ndarray, np.ndarray]:
     shapes = sorted(example.crops.shape[1:3] for example in examples for _ in example.crops)
     if not shapes:
         return np.zeros((0, 8, 8, 3), np.uint8), np.zeros((0, 8, 8), bool)
-    lines, columns = shapes[len(shapes) // 2]
-    alike = [resize_crops(example, (lines, columns)) for example in examples if len(example.crops)]
+    rows, columns = shapes[len(shapes) // 2]
+    alike = [resize_crops(example, (rows, columns)) for example in examples if len(example.crops)]
     return np.concatenate([example.crops for example in alike]), np.concatenate([example.masks for example in alike])
 
 
 def _largest(examples: Sequence[Example]) -> tuple[int, int]:
-    lines, columns = (max(example.image.shape[axis] for example in examples) for axis in (0, 1))
-    return lines, columns
+    rows, columns = (max(example.image.shape[axis] for example in examples) for axis in (0, 1))
+    return rows, columns
 
 
 @contextlib.contextmanager
