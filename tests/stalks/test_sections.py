@@ -324,5 +324,8 @@ def test_images_of_unknown_cameras_and_unfamiliar_ones_are_read_by_other_network
     judged = dataclasses.replace(gate, threshold=threshold)
     finder = Finder(*read_weights(SHIPPED)[:2], 0.0, judged, by_day)
     image = np.random.default_rng(0).integers(0, 256, (96, 128, 3), np.uint8)
-    boxes, others = ([detection.box for detection in find(image, camera)] for find in (finder, by_day))
+    detections = finder(image, camera)
+    boxes, others = ([detection.box for detection in found] for found in (detections, by_day(image, camera)))
     assert others and (boxes == others) == is_replaced
+    if camera is not None:
+        assert detections.is_unfamiliar == is_replaced  # although other networks have read the image

@@ -260,13 +260,13 @@ def _make_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles
         wrong = pair_fault(view.detections, view.sightings, left, right, calibration, view.ground)
     if wrong is not None:
         return {"skipped": wrong}
-    seen = view.detections if isinstance(view.detections, Detections) else Detections()
+    judged = view.detections if isinstance(view.detections, Detections) else Detections()
     return {
         "size": list(left.shape[:2]),
         "lines": list(view.frame.rows),
         "columns": list(view.frame.columns),
-        "doubt": None if seen.doubt is None else round(seen.doubt, 4),
-        "max_doubt": seen.max_doubt,
+        "doubt": None if judged.doubt is None else round(judged.doubt, 4),
+        "max_doubt": judged.max_doubt,
         "camera_height_m": None if view.ground is None else round(view.ground.camera_height, 4),
         "sightings": [sighting.json_values() for sighting in view.sightings],
     }

@@ -209,7 +209,9 @@ class Finder:
         frame = find_frame(image)
         detections = self._find(fill_borders(image, frame), pixels_per_metre, frame, band)
         if self._substitute is not None and detections.is_unfamiliar:
-            return self._substitute(image, pixels_per_metre, band)
+            # The doubt remains that of the first networks: how accurate their substitutes are there is not well known.
+            others = self._substitute(image, pixels_per_metre, band)
+            return Detections(others, detections.doubt, detections.max_doubt)
         ordered = sorted(detections, key=lambda detection: sum(detection.axis))
         in_full_image = (_to_full_image(detection, frame) for detection in ordered)
         return Detections(in_full_image, detections.doubt, detections.max_doubt)
@@ -244,12 +246,16 @@ class Finder:
     def _find(self, image: np.ndarray, pixels_per_metre: float | None, frame: Frame, band: Band | None) -> Detections:
         """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame, in its coordinates.
 
-        ``band`` has the rows of the band in the whole image.
+        ``band`` has the rows of the band in the whole image. Nothing is segmented in an unfamiliar image that a substitute reads.
         """
         settings = self._settings
         relative_scale = settings.width / settings.full_width / settings.scale_for(image.shape[1], pixels_per_metre)
         stalks, scores, pooled = self.detect_boxes(image, pixels_per_metre, None if band is None else in_frame(band, frame))
-        doubt = None if self.gate is None else self.gate.doubt(pooled, scores)
+        detections = Detections()
+        if self.gate is not None:
+            detections = Detections(doubt=self.gate.doubt(pooled, scores), max_doubt=self.gate.threshold)
+        if self._substitute is not None and detections.is_unfamiliar:
+            return detections
         selected = scores >= self._min_score
         stalks, scores = stalks[selected], scores[selected]
         inside = np.array([_is_inside_frame(stalk, frame) for stalk in stalks], bool)
@@ -265,7 +271,6 @@ class Finder:
         some = np.array([higher[place] for place in shown], np.float32).reshape(-1, 6)
         above = self._placed_masks(on_device, some, settings.crop_height // 2, relative_scale)
         upper = {place: (_clear_border_rows(mask, corner, frame), corner) for place, (mask, corner) in zip(shown, above)}
-        detections = Detections(doubt=doubt, max_doubt=None if self.gate is None else self.gate.threshold)
         for place, (stalk, score, (mask, corner)) in enumerate(zip(stalks, scores, pieces)):
             if mask.size:
                 left, top, right, bottom, above, below = (float(edge) - 0.5 for edge in stalk)
