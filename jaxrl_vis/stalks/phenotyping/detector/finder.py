@@ -246,7 +246,7 @@ class Finder:
     def _find(self, image: np.ndarray, pixels_per_metre: float | None, frame: Frame, band: Band | None) -> Detections:
         """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame, in its coordinates.
 
-        ``band`` has the rows of the band in the whole image. Nothing is segmented in an unfamiliar image that a substitute reads.
+        ``band`` has the rows of the band in the whole image. An unfamiliar image that a substitute reads is not segmented.
         """
         settings = self._settings
         relative_scale = settings.width / settings.full_width / settings.scale_for(image.shape[1], pixels_per_metre)
