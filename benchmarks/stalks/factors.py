@@ -84,18 +84,15 @@ def _stem(group: str) -> str:
 
 
 def train(group: str, folder: Path, training: Training) -> Path:
-    """Train without a group of factors, and return the weights file.
-
-    Raises:
-        subprocess.CalledProcessError: The training failed; its message is on stderr.
-    """
+    """Train without a group of factors, and return the weights file; exit with one line if the training fails."""
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED  # of rows at night: no group of factors is known yet
 
     family, weights = folder / f"{_stem(group)}.spec.json", folder / f"{_stem(group)}.safetensors"
     family.write_text(json.dumps(spec(group), indent=1))
     options = {**dataclasses.asdict(training), "spec": family, "start": SHIPPED, "steps": 1_000_000}
     arguments = [word for name, value in options.items() for word in (f"--{name}", str(value))]
-    subprocess.run([sys.executable, "-m", "jaxrl_vis", "phenotype", "train", str(weights), *arguments], check=True)
+    if subprocess.run([sys.executable, "-m", "jaxrl_vis", "phenotype", "train", str(weights), *arguments]).returncode:
+        sys.exit(f"the training without {group} failed, see above; the same command goes on with it")
     return weights
 
 
