@@ -10,7 +10,6 @@ table by column, such as ``{"plants found": "3 of 4"}``: photographs do not ship
 
 import argparse
 import dataclasses
-import importlib
 import json
 import subprocess
 import sys
@@ -20,8 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis.host.plugins import find_component
 from jaxrl_vis.host.provenance import device_name, revision
 
 RESULTS = Path(__file__).parents[1] / "results" / "factors"
@@ -120,8 +121,10 @@ def main() -> None:
         parser.add_argument(f"--{field.name}", type=type(field.default), default=field.default)
     options = parser.parse_args()
     enable_compilation_cache()
-    module, _, name = options.check.partition(":")
-    check = getattr(importlib.import_module(module), name)
+    try:
+        check = find_component("check", options.check, {})
+    except RequestError as error:
+        sys.exit(str(error))
     training = Training(**{field.name: getattr(options, field.name) for field in dataclasses.fields(Training)})
     options.folder.mkdir(parents=True, exist_ok=True)
     for group in options.groups:
