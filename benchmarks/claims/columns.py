@@ -47,6 +47,12 @@ def show_p(value: float) -> str:
     return "< 0.001" if value < 0.0005 else f"{value:.3f}"
 
 
+def p_text(first: Record, second: Record, budget: int | None = None) -> str:
+    """Format the p-value of two records as in text: ``p = 0.032`` or ``p < 0.001``."""
+    shown = show_p(p_value(first, second, budget))
+    return f"p {shown}" if shown.startswith("<") else f"p = {shown}"
+
+
 def verdict(record: Record, reference: Record, budget: int | None = None) -> str:
     """Return ``better`` or ``worse`` if a record's mean success differs significantly from a reference's, else ``level``.
 
@@ -277,7 +283,7 @@ def final_precision() -> Column:
     return Column("of them false, at the end", cell)
 
 
-def distance_to_authors(task: str, variant: str) -> Column:
+def to_authors(task: str, variant: str) -> Column:
     """Return the column of the mean absolute difference between the median success and the authors' released curve.
 
     The 95 % bootstrap interval over seeds is added in parentheses. The cell of the authors' own curve is empty.

@@ -9,6 +9,7 @@ from scipy.stats import spearmanr
 from benchmarks.claims import columns as c
 from benchmarks.claims.markdown import Row, table
 from benchmarks.claims.records import FIRST_FRESH_SEED, Record, ablation, fresh_variants, study
+from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, OPTIONS
 
 LAB, GUIDE = "docs/lab/ol_aux.md", "docs/auxiliary_losses.md"
@@ -17,6 +18,8 @@ BUDGETS = {FETCH: 240_000, HAND: 1_000_000, FINGER: 1_000_000}
 """Environment steps up to which success is averaged, by task; all records reach them."""
 OPTION_BUDGETS = {FETCH: BUDGETS[FETCH], HAND: 600_000}
 """The same for options of OL-AUX-5."""
+_OTHER_OPTIONS = ("ol_aux_5_adam", "ol_aux_5_loss", "ol_aux_5_actor")
+"""Options of OL-AUX-5 that are no variants of the figures: two plug-ins of benchmarks/tasks, and ``--actor-log loss``."""
 LABELS = {
     "none": "without",
     "balance": "balance",
@@ -31,6 +34,11 @@ LABELS = {
 def run(task: str, variant: str, view: str = "") -> Record:
     """Return the run for figures: seeds 0 to 4 of a task with a variant of auxiliary losses, and a view if given."""
     return study("ol_aux", f"{task}-{variant}-paper" + (f"-{view}" if view else ""))
+
+
+def to_authors(record: Record, task: str) -> str:
+    """Format the mean absolute difference between a record's success and the authors' curve without auxiliary losses."""
+    return f"{mean_difference(record.points, released_curves()[task, 'none']):.3f}"
 
 
 @functools.cache
@@ -120,7 +128,7 @@ def _departures() -> str:
     rows = [Row("the authors' curve", c.authors(FETCH, "none", budget))]
     rows += [Row(label, record) for label, record in records.items()]
     columns = [
-        c.distance_to_authors(FETCH, "none"),
+        c.to_authors(FETCH, "none"),
         c.mean_success(budget),
         c.p_value_against(base, "`paper`", budget),
         *(c.mean_at(count * 1000) for count in (60, 80, 100, 120, 160, 200)),
@@ -190,26 +198,25 @@ def _main() -> str:
 
 
 def options(task: str) -> dict[str, Record]:
-    """Return the kept runs of OL-AUX-5's options on a task, with the tuning seeds, by variant."""
-    return {variant: run(task, variant) for variant in (*OPTIONS, "ol_aux_5_adam") if _is_kept(task, variant)}
+    """Return the runs of OL-AUX-5's options on a task, with the tuning seeds, by variant."""
+    return {variant: run(task, variant) for variant in (*OPTIONS, *_OTHER_OPTIONS)}
 
 
 def _options(task: str) -> str:
     base, budget = run(task, "ol_aux_5"), OPTION_BUDGETS[task]
     rows = [Row("OL-AUX-5", base), *(Row(f"`{variant}`", record) for variant, record in options(task).items())]
+    loss, actor = (options(task)[variant] for variant in ("ol_aux_5_loss", "ol_aux_5_actor"))
+    against_loss = c.Column(
+        "p against `ol_aux_5_loss`",
+        lambda record: c.show_p(c.p_value(record, loss, budget)) if record is actor else "",
+    )
     weights = [f"train/weight/{name}" for name in AUX_TASKS]
     total = c.Column(
         f"sum of weights at {c.format_steps(budget)}",
         lambda record: f"{sum(record.median(budget, metric=name) for name in weights):.0f}",
     )
-    return table([task], rows, [c.mean_success(budget), c.p_value_against(base, "OL-AUX-5", budget), total, c.names()])
-
-
-def _is_kept(task: str, variant: str) -> bool:
-    try:
-        return bool(run(task, variant))
-    except LookupError:
-        return False
+    against_base = c.p_value_against(base, "OL-AUX-5", budget)
+    return table([task], rows, [c.mean_success(budget), against_base, against_loss, total, c.names()])
 
 
 def tables() -> dict[str, dict[str, str]]:
