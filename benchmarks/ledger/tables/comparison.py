@@ -52,13 +52,13 @@ RATES = (
         *("render/scene", "render/peer_warp", {"scene": "primitives", **_IMAGE}, "H200", "images", "MuJoCo Warp"),
     ),
     Rate(
-        "Images of a Fetch arm with its own meshes, 64x64 RGB-D and labels, on an H100",
-        *("render/scene", "render/peer_warp", {"scene": "fetch_mesh", **_LABELLED}, "H100", "images", "MuJoCo Warp"),
+        "Images of 500 meshes with shadows and labels, likewise",
+        *("render/scene", "render/peer_warp", {"scene": "clutter", "shadows": True, **_LABELLED}, "H200", "images"),
+        "MuJoCo Warp",
     ),
     Rate(
-        "Images of 500 meshes with shadows, likewise",
-        *("render/scene", "render/peer_warp", {"scene": "clutter", "shadows": True, **_LABELLED}, "H100", "images"),
-        "MuJoCo Warp",
+        "Images of a Fetch arm with its own meshes, 64x64 RGB-D and labels, on an H100",
+        *("render/scene", "render/peer_warp", {"scene": "fetch_mesh", **_LABELLED}, "H100", "images", "MuJoCo Warp"),
     ),
     Rate(
         "Images of VisualFetchReach on two CPU cores",

@@ -7,7 +7,7 @@ from benchmarks.ledger.tables.lab_results import format_short
 from jaxrl_vis.bench.record import load
 
 _WARP_RECORDS, _MUJOCO_RECORDS = "render-nvidia-h200-x1.json", "render-amd-epyc-2-cores.json"
-_MESH_RECORDS = "render-nvidia-h100-80gb-hbm3-x1.json"
+_MESH_RECORDS = {"H100": "render-nvidia-h100-80gb-hbm3-x1.json", "H200": _WARP_RECORDS}
 _OURS, _WARP, _MUJOCO = "render/scene", "render/peer_warp", "render/peer_mujoco"
 _ORDER = ("finger", "fetch_reach", "primitives")
 _TEXTURED = ("finger", "primitives")  # fetch_reach has no textures to omit
@@ -62,25 +62,27 @@ def mujoco_table(results: Path) -> str:
 
 def gpu_mesh_table(results: Path) -> str:
     """Return a table that compares MuJoCo Warp's renderer with ours on scenes of meshes, in images per second, as Markdown."""
-    return _mesh_table(results / _MESH_RECORDS, _WARP, "MuJoCo Warp 4.0.0")
+    rows = [f"| {gpu} {row}" for gpu, file in _MESH_RECORDS.items() for row in _mesh_rows(results / file, _WARP)]
+    return "\n".join(["| GPU | scene | images | ours | MuJoCo Warp 4.0.0 | ratio |", "|---|---|---|---|---|---|", *rows])
 
 
 def cpu_mesh_table(results: Path) -> str:
     """Return a table that compares MuJoCo's own renderer with ours on scenes of meshes, in images per second, as Markdown."""
-    return _mesh_table(results / _MUJOCO_RECORDS, _MUJOCO, "`mujoco.Renderer`")
+    title = ["| scene | images | ours | `mujoco.Renderer` | ratio |", "|---|---|---|---|---|"]
+    return "\n".join([*title, *_mesh_rows(results / _MUJOCO_RECORDS, _MUJOCO)])
 
 
-def _mesh_table(file: Path, peer: str, title: str) -> str:
+def _mesh_rows(file: Path, peer: str) -> list[str]:
     records = [record for record in load(file) if record["config"]["pixels"] == "rgbds"]
     ours = {str(record["config"]): record for record in records if record["name"] == _OURS}
-    lines = [f"| scene | images | ours | {title} | ratio |", "|---|---|---|---|---|"]
+    rows = []
     for record in records:
         if record["name"] != peer:
             continue
         config, size = record["config"], record["config"]["image_size"]
         names = [name for name in ("textures", "shadows") if config.get(name)]
         scene = config["scene"] + (f", with {' and '.join(names)}" if names else "")
-        rates = (format_short(each["value"]) for each in (ours[str(config)], record))
+        rates = (format_short(rate["value"]) for rate in (ours[str(config)], record))
         cells = [scene, f"{size}x{size}, {config['images']:,}", *rates, f"{record['details']['ours_over_peer']:.3g}"]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append(f"| {' | '.join(cells)} |")
+    return rows
