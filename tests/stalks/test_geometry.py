@@ -133,15 +133,21 @@ def test_widths_do_not_depend_on_crops_borders_and_lenses():
     assert len(beside) >= 3 and np.median(beside) < 0.1
 
 
-def stalks_at(disparity: int) -> tuple[np.ndarray, np.ndarray, list[Detection]]:
-    """Return a pair of six textured stalks at a disparity, and the detections of a perfect detector."""
+def stalks_at(disparity: int, *others: int) -> tuple[np.ndarray, np.ndarray, list[Detection]]:
+    """Return a pair of six textured stalks, and the detections of a perfect detector.
+
+    Args:
+        disparity: Disparity of the stalks, pixels.
+        others: That of the last stalks, if it differs.
+    """
     rng = np.random.default_rng(0)
     left, right = (rng.integers(0, 20, (400, 844, 3)).astype(np.uint8) for _ in range(2))
     finds = []
-    for column in COLUMNS:
+    disparities = [disparity] * (len(COLUMNS) - len(others)) + list(others)
+    for column, shift in zip(COLUMNS, disparities):
         texture = rng.integers(60, 255, (400, 14, 1)).astype(np.uint8)
         left[:, column : column + 14] = texture
-        right[:, column - disparity : column - disparity + 14] = texture
+        right[:, column - shift : column - shift + 14] = texture
         mask = np.zeros((200, 24), bool)
         mask[:, 5:19] = True
         finds.append(
@@ -289,6 +295,19 @@ def test_a_row_that_stands_nowhere_is_reported(baseline, distance):
     wrong = dataclasses.replace(CAMERA, baseline=baseline)
     told = pair_fault(finds, measure_pair(finds, left, right, wrong), left, right, wrong)
     assert told is not None and told.startswith(f"its stalks stand {distance} m away") and "about 0.1 m would" in told
+
+
+def test_stalks_of_the_row_behind_are_placed_there():
+    """Something similar is nearer: within the depths of a row alone, the stalks would be matched with it."""
+    left, right, finds = stalks_at(68, 34, 34, 34)
+    for column in COLUMNS[-3:]:
+        noise = np.random.default_rng(column).integers(-120, 120, (400, 14, 3))
+        right[:, column - 60 : column - 46] = np.clip(left[:, column : column + 14].astype(int) + noise, 0, 255)
+    sightings = measure_pair(finds, left, right, CAMERA)
+    assert [sighting.depth_m for sighting in sightings[:3]] == pytest.approx([54.2 / 68] * 3, abs=0.02)
+    assert [sighting.depth_m for sighting in sightings[3:]] == pytest.approx([54.2 / 34] * 3, abs=0.04)
+    assert all(sighting.diameter_mm is None and "m away" in sighting.reason for sighting in sightings[3:])
+    assert pair_fault(finds, sightings, left, right, CAMERA) is None
 
 
 def test_what_the_right_image_does_not_reach_has_no_depth():

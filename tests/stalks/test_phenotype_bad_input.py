@@ -70,8 +70,8 @@ def test_swapped_and_unrectified_pairs_are_reported():
 
     assert told(left, right) is None
     assert told(right, left, disparity) == "left and right are swapped: exchange their names"
-    assert told(left, np.roll(right, 6, axis=0)) == "the right image lies about 6 lines too low: rectify the pair"
-    assert told(left, np.roll(right, -12, axis=0)) == "the right image lies about 12 lines too high: rectify the pair"
+    assert told(left, np.roll(right, 6, axis=0)) == "the right image lies about 6 rows too low: rectify the pair"
+    assert told(left, np.roll(right, -12, axis=0)) == "the right image lies about 12 rows too high: rectify the pair"
     assert told(left, np.zeros_like(right)) is None
 
 

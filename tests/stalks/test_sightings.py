@@ -17,7 +17,7 @@ from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement
 from jaxrl_vis.stalks.phenotyping.track.direction import track_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track, track_stalks
 from jaxrl_vis.stalks.phenotyping.track.heights import USUAL_TAPER, robust_width, stalk_widths
-from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, _occluded_edges
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, _occluded_edges, near_row_depth
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import StalkInView
 
@@ -245,6 +245,22 @@ def test_what_stands_before_the_row_or_has_no_place_counts_less():
                 if 4 <= number < 4 + count:
                     frame.append(dataclasses.replace(each, diameter_mm=None, depth_m=None, along_m=None, reason="unclear"))
         assert sum(track.counted for track in track_stalks(frames, distances, CAMERAS)[0]) == len(STALKS) + more
+
+
+@pytest.mark.parametrize("behind", [1.1, 1.6])
+def test_rows_behind_are_not_counted_even_if_more_of_their_stalks_are_in_view(behind):
+    others = [(x, behind) for x in np.arange(-0.3, 2.3, 0.08)]
+    frames, distances = drive([*STALKS, *others])
+    assert np.median([sighting.depth_m for frame in frames for sighting in frame]) == pytest.approx(behind, abs=0.02)
+    tracks, path = track_stalks(frames, distances, CAMERAS)
+    assert path.row_depth == pytest.approx(0.8, abs=0.01) and sum(track.counted for track in tracks) == len(STALKS)
+    assert {path.is_behind_row(sighting) for sighting in frames[0] if sighting.depth_m > 1.0} == {True}  # pyright: ignore
+    assert not any(path.is_behind_row(sighting) for sighting in frames[0] if sighting.depth_m < 1.0)  # pyright: ignore
+
+
+def test_the_depth_of_the_near_row():
+    assert near_row_depth([0.4, 1.6, 0.8, 1.58, 0.82, 1.61, 0.78, 1.6]) == pytest.approx(0.8)  # 0.4: a leaf
+    assert near_row_depth([1.2, 1.22, 0.8, 1.21]) == pytest.approx(1.21) and near_row_depth([0.9]) == 0.9
 
 
 def test_no_pairs_and_empty_fields():

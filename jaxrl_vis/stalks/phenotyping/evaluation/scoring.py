@@ -44,7 +44,7 @@ class PlotScore:
             compilation; NaN for a single pair.
         thesis: Score of the thesis's methods on the same detections; None if they were not evaluated.
         detections: Score of each detection, and 1 for a true or 0 for a false positive, [K, 2] float64; matches of mostly
-            occluded stalks are left out.
+            occluded stalks are left out, and so are detections that stereo places behind the row.
         stalks: Number of detectable stalks (ground-truth positives), summed over all pairs.
     """
 
@@ -96,8 +96,7 @@ def score_plot(
     # By day, each plot has its own distance, which `phenotype run` estimates by stereo.
     distance = plot.family.rig.distance if plot.family.scene.share > 0 else USUAL_DISTANCE
     frames: list[list[Sighting]] = []
-    owners: list[list[int | None]] = []
-    scored_detections: list[tuple[float, float]] = []
+    outcomes: list[tuple[list[Detection], list[int], list[StalkInView]]] = []
     as_thesis: list[list[Sighting]] = []
     total, seconds = 0, []
     for pair in sequence:
@@ -112,11 +111,18 @@ def score_plot(
         seconds.append(time.monotonic() - started)
         if with_thesis:
             as_thesis.append(measure_pair_as_thesis(kept_detections, left, right, drive.stated))
-        matched, scored = match_detections(detections, stalks)
         total += sum(stalk.band_box is not None and stalk.band_visible >= MIN_VISIBLE for stalk in stalks)
+        outcomes.append((detections, selected, stalks))
+    tracks, path = track_stalks(frames, drive.odometry, drive.stated)
+    owners: list[list[int | None]] = []
+    scored_detections: list[tuple[float, float]] = []
+    for (detections, selected, stalks), sightings in zip(outcomes, frames):
+        behind = {place for place, sighting in zip(selected, sightings) if path.is_behind_row(sighting)}
+        others = [place for place in range(len(detections)) if place not in behind]
+        matched, scored = match_detections([detections[place] for place in others], stalks)
+        owner = dict(zip(others, matched))
+        owners.append([owner.get(place) for place in selected])
         scored_detections += scored
-        owners.append([matched[place] for place in selected])
-    tracks, _ = track_stalks(frames, drive.odometry, drive.stated)
     widths, upper, errors = [], [], []
     counted = [track for track in tracks if track.counted]
     for track, measured in zip(counted, stalk_widths(frames, counted)):

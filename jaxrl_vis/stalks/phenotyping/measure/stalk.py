@@ -16,6 +16,8 @@ from jaxrl_vis_envs.plants import Calibration
 Method = Literal["strip", "ellipse"]
 DEPTHS = (0.5, 1.3)
 """Minimum and maximum depth of the stalks of a row, m."""
+_BEHIND = 4.0  # m: depth up to which stalks behind the row are matched, as by day they would be matched with nearer ones
+_CLEARLY = 1.25  # factor of the correlations behind the row to those in it: windows of a stalk also match by chance
 _WINDOWS = 16
 _REACH = 0.025  # m along a stalk, within which edges are measured: sheaths and nodes beyond have no effect
 
@@ -169,9 +171,15 @@ def _disparity(
     depths: tuple[float, float],
     disparity: np.ndarray | None,
 ) -> StalkDisparity:
-    """Compute the disparities of a stalk within a range of depths, m; see `stalk_disparity`."""
-    far, near = (float(calibration.disparity(np.array(depth))) for depth in (depths[1], depths[0]))
-    return stalk_disparity(strip, corner, left, right, calibration, (far, near), disparity)
+    """Compute the disparities of a stalk within a range of depths, m, or behind it if it clearly correlates more there.
+
+    See `stalk_disparity`.
+    """
+    limits = [float(calibration.disparity(np.array(depth))) for depth in (_BEHIND, *depths[::-1])]
+    behind, in_row = (
+        stalk_disparity(strip, corner, left, right, calibration, bounds, disparity) for bounds in zip(limits, limits[1:])
+    )
+    return behind if behind.scores.sum() > _CLEARLY * in_row.scores.sum() else in_row
 
 
 def stalk_disparity(

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, near_row_depth
 from jaxrl_vis_envs.plants import Calibration
 
 _USUAL_DEPTH = 0.8  # m, if no depth was measured
@@ -30,7 +30,7 @@ class Gates:
         merge: Maximum distance along the row between two tracks of one stalk, which are merged.
         merge_across_depths: The same for tracks of different depth, with the rays of one evaluated at the depth of the other.
         max_shared: Maximum fraction of the pairs of the shorter track in which both are seen, to merge them.
-        max_row_offset: Maximum difference between the depth of a counted stalk and the median depth.
+        max_row_offset: Maximum difference between the depth of a counted stalk and that of the row.
         min_fraction: Minimum fraction of the pairs with the stalk in view that must show it to count it.
         min_pairs: Minimum number of pairs that must show it, unless fewer have it in view.
         end_margin: Maximum distance of a counted stalk's foot beyond the ends of the path.
@@ -74,11 +74,17 @@ class RobotPath:
         positions: [F] float64, position of each pair along the row, m: odometry corrected by stereo.
         length: Length of the row that was passed, m, including half a step at each end.
         seen_fraction: Fraction of that length in view of any pair.
+        row_depth: Depth of the row from the cameras, m.
     """
 
     positions: np.ndarray
     length: float
     seen_fraction: float = 1.0
+    row_depth: float = _USUAL_DEPTH
+
+    def is_behind_row(self, sighting: Sighting, max_offset: float = Gates.max_row_offset) -> bool:
+        """Return True if stereo places a sighting more than ``max_offset``, m, behind the row."""
+        return sighting.depth_m is not None and sighting.depth_m - self.row_depth > max_offset
 
 
 @dataclasses.dataclass
@@ -137,7 +143,7 @@ def track_stalks(
     correction = 0.0
     driven = np.asarray(distances, float) - (distances[0] if len(distances) else 0.0)
     row = [sighting.depth_m for sightings in frames for sighting in sightings if sighting.depth_m is not None]
-    usual = float(np.median(row)) if row else _USUAL_DEPTH
+    usual = near_row_depth(row) if row else _USUAL_DEPTH
     for frame, sightings in enumerate(frames):
         view = _PairView.of(sightings, calibration, usual)
         positions[frame] = driven[frame] + correction
@@ -168,10 +174,9 @@ def track_stalks(
         (column - 0.5 - calibration.centre[0]) / calibration.focal for column in columns or (0.0, float(calibration.width))
     )
     length = abs(float(positions[-1] - positions[0]) + step) if len(positions) else 0.0
-    path = RobotPath(
-        positions, length, _seen_fraction(positions, step, [ray * usual - 0.5 * calibration.baseline for ray in field])
-    )
-    closed = [_finish_track(track, path, step, field, usual, gates) for track in _merge_tracks(tracks, gates)]
+    in_view = [ray * usual - 0.5 * calibration.baseline for ray in field]
+    path = RobotPath(positions, length, _seen_fraction(positions, step, in_view), usual)
+    closed = [_finish_track(track, path, step, field, gates) for track in _merge_tracks(tracks, gates)]
     return sorted(closed, key=lambda track: track.position_m * (-1.0 if step < 0 else 1.0)), path
 
 
@@ -202,7 +207,7 @@ class _PairView:
         is_candidate: True if the sighting may be a stalk of the row.
         foot_offset: Distance along the row from the stalk's foot to its measurement, m; 0 if its height is unknown.
         half: Half the baseline (scalar), m.
-        usual: Median depth over all pairs (scalar), m.
+        usual: Depth of the row over all pairs (scalar), m.
     """
 
     rays: np.ndarray
@@ -324,10 +329,8 @@ def _track_distance(track: _OpenTrack, other: _OpenTrack) -> tuple[float, float]
     return abs(track.position_at(depth) - other.position_at(depth)), 0.0
 
 
-def _finish_track(
-    track: _OpenTrack, path: RobotPath, step: float, field: tuple[float, ...], usual: float, gates: Gates
-) -> Track:
-    position = float(np.median(track.along))
+def _finish_track(track: _OpenTrack, path: RobotPath, step: float, field: tuple[float, ...], gates: Gates) -> Track:
+    position, usual = float(np.median(track.along)), path.row_depth
     depths = track.depths()
     depth = float(np.median(depths)) if depths.size else math.nan
     # Expected number of sightings: pairs with the stalk well inside the field of view.

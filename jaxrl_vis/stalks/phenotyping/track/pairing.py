@@ -8,7 +8,7 @@ from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, find_ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import DEPTHS, measure_stalk, stalk_disparity
 from jaxrl_vis.stalks.phenotyping.measure.width import fit_strip
-from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sighting, to_grey_bytes
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sighting, near_row_depth, to_grey_bytes
 from jaxrl_vis_envs.plants import Calibration
 
 _MIN_STALKS = 4
@@ -62,7 +62,7 @@ def pair_fault(
     for rows in sorted({max(round(offset * calibration.focal / 2168), 3) for offset in _ROW_OFFSETS}):
         for shift in (rows, -rows):
             if _measured_fraction(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _LARGE_FRACTION:
-                return f"the right image lies about {rows} lines too {'high' if shift > 0 else 'low'}: rectify the pair"
+                return f"the right image lies about {rows} rows too {'high' if shift > 0 else 'low'}: rectify the pair"
     return None
 
 
@@ -85,7 +85,7 @@ def _distance_fault(detections: list[Detection], left: np.ndarray, right: np.nda
     ]
     if len(depths) < _MIN_STALKS:
         return None
-    depth = float(np.median(depths))
+    depth = near_row_depth(depths)
     agree = np.mean(np.abs(np.array(depths) / depth - 1.0) < _SAME_DEPTH)
     if DEPTHS[0] <= depth <= DEPTHS[1] or agree < _LARGE_FRACTION:
         return None

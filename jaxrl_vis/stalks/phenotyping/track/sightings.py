@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, get_args, get_origin
 
@@ -28,6 +28,8 @@ USUAL_DISTANCE = 0.8
 _OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is found at the usual one
 _SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
 _AT_DISTANCE = 3  # minimum number of stalks to estimate the distance of the row
+_ROW_DEPTH = 1.3  # maximum ratio of the depths of a row's stalks
+_ROW_SHARE = 0.15  # minimum fraction of the measured stalks that stand in the row
 _FAR_FROM_ROW = 0.2  # m: distance from the row beyond which a match is suspicious
 _OCCLUSION_FACTOR = 0.1  # factor of the confidence of a sighting with an edge that may be occluded
 _BEHIND = 0.003  # m: a stalk further behind occludes nothing
@@ -222,9 +224,24 @@ def view_pair(
 
 
 def row_distance(sightings: list[Sighting]) -> float | None:
-    """Return the median depth of the measured stalks of one or several pairs, m; None if there are fewer than three."""
+    """Return the depth of the row of plants in one or several pairs, m; None if fewer than three stalks were measured."""
     depths = [sighting.depth_m for sighting in sightings if sighting.diameter_mm is not None and sighting.depth_m is not None]
-    return float(np.median(depths)) if len(depths) >= _AT_DISTANCE else None
+    return near_row_depth(depths) if len(depths) >= _AT_DISTANCE else None
+
+
+def near_row_depth(depths: Sequence[float]) -> float:
+    """Return the median depth of the stalks in the nearest row, m.
+
+    By day the cameras also see the rows behind, which may have more stalks in view.
+
+    Args:
+        depths: Depths of one or more stalks, m; fewer than three at one depth are no row, if there are more at another.
+    """
+    ordered = np.sort(np.asarray(depths, float))
+    in_row = np.searchsorted(ordered, ordered * _ROW_DEPTH, side="right") - np.arange(len(ordered))
+    enough = min(max(_AT_DISTANCE, _ROW_SHARE * len(ordered)), in_row.max())
+    first = int(np.argmax(in_row >= enough))
+    return float(np.median(ordered[first : first + in_row[first]]))
 
 
 def measure_pair(
@@ -293,7 +310,7 @@ def _without_mismatches(
     depths = [measurement.depth for measurement, _ in measured if measurement.diameter_mm is not None]
     if len(depths) < _AT_DISTANCE:
         return measured
-    row_depth = float(np.median(depths))
+    row_depth = near_row_depth(depths)
     disparity = float(calibration.disparity(np.array(row_depth)))
     valid = []
     for measurement, upper in measured:
