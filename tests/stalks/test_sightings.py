@@ -17,7 +17,8 @@ from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement
 from jaxrl_vis.stalks.phenotyping.track.direction import track_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track, track_stalks
 from jaxrl_vis.stalks.phenotyping.track.heights import USUAL_TAPER, robust_width, stalk_widths
-from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, _occluded_edges, near_row_depth
+from jaxrl_vis.stalks.phenotyping.track.near_row import near_row_depth
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, _occluded_edges
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import StalkInView
 

@@ -175,11 +175,13 @@ def _disparity(
 
     See `stalk_disparity`.
     """
-    limits = [float(calibration.disparity(np.array(depth))) for depth in (_BEHIND, *depths[::-1])]
-    behind, in_row = (
-        stalk_disparity(strip, corner, left, right, calibration, bounds, disparity) for bounds in zip(limits, limits[1:])
-    )
-    return behind if behind.scores.sum() > _CLEARLY * in_row.scores.sum() else in_row
+    behind, far, near = (float(calibration.disparity(np.array(depth))) for depth in (_BEHIND, *depths[::-1]))
+    in_row = stalk_disparity(strip, corner, left, right, calibration, (far, near), disparity)
+    wanted = _CLEARLY * in_row.scores.sum()
+    if wanted >= in_row.window_count:  # no correlation exceeds 1
+        return in_row
+    matched = stalk_disparity(strip, corner, left, right, calibration, (behind, far), disparity)
+    return matched if matched.scores.sum() > wanted else in_row
 
 
 def stalk_disparity(

@@ -11,7 +11,8 @@ import math
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, near_row_depth
+from jaxrl_vis.stalks.phenotyping.track.near_row import near_row_depth
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 from jaxrl_vis_envs.plants import Calibration
 
 _USUAL_DEPTH = 0.8  # m, if no depth was measured
@@ -82,9 +83,9 @@ class RobotPath:
     seen_fraction: float = 1.0
     row_depth: float = _USUAL_DEPTH
 
-    def is_behind_row(self, sighting: Sighting, max_offset: float = Gates.max_row_offset) -> bool:
-        """Return True if stereo places a sighting more than ``max_offset``, m, behind the row."""
-        return sighting.depth_m is not None and sighting.depth_m - self.row_depth > max_offset
+    def is_behind_row(self, sighting: Sighting) -> bool:
+        """Return True if stereo places a sighting further behind the row than a counted stalk may be."""
+        return sighting.depth_m is not None and sighting.depth_m - self.row_depth > Gates.max_row_offset
 
 
 @dataclasses.dataclass

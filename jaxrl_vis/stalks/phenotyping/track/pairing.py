@@ -8,7 +8,8 @@ from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, find_ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import DEPTHS, measure_stalk, stalk_disparity
 from jaxrl_vis.stalks.phenotyping.measure.width import fit_strip
-from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sighting, near_row_depth, to_grey_bytes
+from jaxrl_vis.stalks.phenotyping.track.near_row import near_row_depth
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sighting, to_grey_bytes
 from jaxrl_vis_envs.plants import Calibration
 
 _MIN_STALKS = 4

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, get_args, get_origin
 
@@ -16,6 +16,7 @@ from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_rows, find_ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement, Method, measure_stalk
 from jaxrl_vis.stalks.phenotyping.measure.width import fit_strip
+from jaxrl_vis.stalks.phenotyping.track.near_row import MIN_STALKS, near_row_depth
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import HEIGHTS
 
@@ -27,9 +28,6 @@ USUAL_DISTANCE = 0.8
 """Default distance from the cameras to the row of plants, m."""
 _OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is found at the usual one
 _SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
-_AT_DISTANCE = 3  # minimum number of stalks to estimate the distance of the row
-_ROW_DEPTH = 1.3  # maximum ratio of the depths of a row's stalks
-_ROW_SHARE = 0.15  # minimum fraction of the measured stalks that stand in the row
 _FAR_FROM_ROW = 0.2  # m: distance from the row beyond which a match is suspicious
 _OCCLUSION_FACTOR = 0.1  # factor of the confidence of a sighting with an edge that may be occluded
 _BEHIND = 0.003  # m: a stalk further behind occludes nothing
@@ -211,7 +209,7 @@ def view_pair(
     there = row_distance(usual.sightings)
     if calibration is None or (there is not None and abs(there / USUAL_DISTANCE - 1.0) <= _SAME_DISTANCE):
         return usual
-    if there is None and len(detections) >= _AT_DISTANCE:
+    if there is None and len(detections) >= MIN_STALKS:
         return usual
     for distance in _OTHER_DISTANCES if there is None else (there,):
         band = functools.partial(band_rows, ground, calibration, distance)
@@ -226,22 +224,7 @@ def view_pair(
 def row_distance(sightings: list[Sighting]) -> float | None:
     """Return the depth of the row of plants in one or several pairs, m; None if fewer than three stalks were measured."""
     depths = [sighting.depth_m for sighting in sightings if sighting.diameter_mm is not None and sighting.depth_m is not None]
-    return near_row_depth(depths) if len(depths) >= _AT_DISTANCE else None
-
-
-def near_row_depth(depths: Sequence[float]) -> float:
-    """Return the median depth of the stalks in the nearest row, m.
-
-    By day the cameras also see the rows behind, which may have more stalks in view.
-
-    Args:
-        depths: Depths of one or more stalks, m; fewer than three at one depth are no row, if there are more at another.
-    """
-    ordered = np.sort(np.asarray(depths, float))
-    in_row = np.searchsorted(ordered, ordered * _ROW_DEPTH, side="right") - np.arange(len(ordered))
-    enough = min(max(_AT_DISTANCE, _ROW_SHARE * len(ordered)), in_row.max())
-    first = int(np.argmax(in_row >= enough))
-    return float(np.median(ordered[first : first + in_row[first]]))
+    return near_row_depth(depths) if len(depths) >= MIN_STALKS else None
 
 
 def measure_pair(
@@ -308,7 +291,7 @@ def _without_mismatches(
         first_column: First column of the right image without a black border.
     """
     depths = [measurement.depth for measurement, _ in measured if measurement.diameter_mm is not None]
-    if len(depths) < _AT_DISTANCE:
+    if len(depths) < MIN_STALKS:
         return measured
     row_depth = near_row_depth(depths)
     disparity = float(calibration.disparity(np.array(row_depth)))
