@@ -7,10 +7,11 @@ from jaxrl_vis.report.plots import format_steps
 
 GUIDE, FOLDER = "docs/tasks.md", "contrastive_view"
 _METHODS = {
-    "indicator_balance_filter": "indicator_balance_filter",
-    "oracle": "oracle",
-    "contrastive": "contrastive",
-    "contrastive_1M": "contrastive",
+    "indicator_balance_filter": "`indicator_balance_filter`",
+    "oracle": "`oracle`",
+    "contrastive": "`contrastive`, `stable`",
+    "contrastive_1M": "`contrastive`, `stable`",
+    "contrastive_nce_1M": "`contrastive`, `nce`",
 }
 """Method by name of the run, in the order of the rows."""
 _EARLY = 15_000
@@ -31,5 +32,5 @@ def tables() -> dict[str, dict[str, str]]:
         c.seconds(),
         c.names(),
     ]
-    rows = [Row(f"`{_METHODS[name]}`", records[name]) for name in sorted(records, key=list(_METHODS).index)]
+    rows = [Row(_METHODS[name], records[name]) for name in sorted(records, key=list(_METHODS).index)]
     return {GUIDE: {FOLDER: table(["method"], rows, columns)}}

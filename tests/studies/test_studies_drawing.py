@@ -24,3 +24,12 @@ def test_no_text_of_a_figure_is_cut(figure: str) -> None:
     boxes = [*lines, composed.legends[0].get_window_extent(), composed.axes[0].get_tightbbox()]
     assert all(box.x0 >= 0.0 and box.x1 <= composed.bbox.x1 for box in boxes)
     assert all(above.y0 >= below.y1 for above, below in itertools.pairwise(lines))  # and no line lies on the next
+
+
+def test_rows_with_another_x_axis_have_a_label_each() -> None:
+    """Regression test: seconds were labelled as environment steps, and steps above them had no label."""
+    curve = Curve("oracle", "#000000", np.array([0.5, 2.5]), np.ones((1, 2)))
+    steps, seconds = Panel("success", [curve]), Panel("success", [curve], x_label="seconds")
+    assert [axes.get_xlabel() for axes in compose([[steps], [seconds]], "", "").axes] == [steps.x_label, "seconds"]
+    assert [axes.get_xlabel() for axes in compose([[steps], [steps]], "", "").axes] == ["", steps.x_label]
+    assert compose([[seconds]], "", "").axes[0].get_xlim()[1] > 2.5  # the end of a curve is not cut

@@ -24,7 +24,10 @@ def make_content(
     shown = {key: line for key, line in lines.items() if key[1] in variants}
     known = request.study.family.variants
     of_steps = [Panel(f"{task}: success", _curves(shown, known, task)) for task in tasks]
-    of_seconds = [Panel(f"{task}: success, by seconds", _curves(shown, known, task, by_seconds=True)) for task in tasks]
+    of_seconds = [
+        Panel(f"{task}: success", _curves(shown, known, task, by_seconds=True), x_label="seconds without compilation, all seeds")
+        for task in tasks
+    ]
     text, rows = _tables(shown, known, tasks)
     notes = [
         "Mean success: over all evaluations of a run, the area under its curve; interquartile mean over seeds with its 95 % "

@@ -24,7 +24,7 @@ class Curve:
     Attributes:
         label: Label in the legend; lines with the same label share an entry.
         colour: Colour of the line.
-        steps: [P] environment steps.
+        steps: [P] environment steps, or other positions on the panel's x axis.
         values: [S, P], one row per seed, NaN for gaps.
         is_reference: Whether these are published results of others, drawn thin, dashed and behind the others.
     """
@@ -44,11 +44,13 @@ class Panel:
         title: Title of the panel.
         curves: Lines of the panel.
         is_share: Whether values are fractions in [0, 1], shown in percent.
+        x_label: Label of the x axis; shown below the lowest of several panels with the same label.
     """
 
     title: str
     curves: Sequence[Curve]
     is_share: bool = True
+    x_label: str = "environment steps per seed"
 
     @property
     def has_values(self) -> bool:
@@ -107,8 +109,10 @@ def compose(rows: Sequence[Sequence[Panel]], title: str, subtitle: str) -> Figur
         _draw(axes, panel)
         handles, names = axes.get_legend_handles_labels()
         entries |= {name: handle for name, handle in zip(names, handles, strict=True) if name not in entries}
-    for axes in grid[-1]:
-        axes.set_xlabel("environment steps per seed", fontsize=9.5, color=INK)
+    for row, below_row, all_axes in zip(rows, [*rows[1:], [None] * len(rows[-1])], grid, strict=True):
+        for panel, lower, axes in zip(row, below_row, all_axes, strict=True):
+            if lower is None or lower.x_label != panel.x_label:
+                axes.set_xlabel(panel.x_label, fontsize=9.5, color=INK)
     for number, line in enumerate(titles):
         y = 1 - (0.22 + _TITLE_LINE * number) / height
         figure.text(0.35 / width, y, line, fontsize=14, weight="bold", color=INK, va="center")
@@ -140,7 +144,7 @@ def _break_lines(text: str, max_characters: int) -> list[str]:
 
 
 def _draw(axes: Axes, panel: Panel) -> None:
-    ends = [int(curve.steps[-1]) for curve in panel.curves if curve.steps.size and not curve.is_reference]
+    ends = [float(curve.steps[-1]) for curve in panel.curves if curve.steps.size and not curve.is_reference]
     end = max(ends, default=1)
     for curve in panel.curves:
         if curve.is_reference:
