@@ -25,7 +25,9 @@ def make_content(
     known = request.study.family.variants
     of_steps = [Panel(f"{task}: success", _curves(shown, known, task)) for task in tasks]
     of_seconds = [
-        Panel(f"{task}: success", _curves(shown, known, task, by_seconds=True), x_label="seconds without compilation, all seeds")
+        Panel(
+            f"{task}: success", _curves(shown, known, task, by_seconds=True), x_label="seconds without compilation, all seeds"
+        )
         for task in tasks
     ]
     text, rows = _tables(shown, known, tasks)
