@@ -23,13 +23,15 @@ from jaxrl_vis.host.worker_pool import evaluate_all, share_accelerator
 from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Finder, in_frame
 from jaxrl_vis.stalks.phenotyping.detector.gate import Gate, fit_gate, fit_logistic_regression, gate_path, write_gate
 from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder
-from jaxrl_vis.stalks.phenotyping.detector.sections import STALK
+from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.weights import PHOTOGRAPHS, SHIPPED
 from jaxrl_vis.stalks.phenotyping.measure.borders import fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.training.examples import true_boxes
 from jaxrl_vis.stalks.phenotyping.training.held_out import MIN_SCORE, match_to_annotations
 from jaxrl_vis_envs import plants
+from jaxrl_vis_envs.plants import Calibration, Plot, Pose
 from jaxrl_vis_envs.plants.pairs import Sequence
+from jaxrl_vis_envs.plants.truth import outline
 
 FAMILIES = Path(__file__).with_name("families")
 SPECS = ("daylight_all", "daylight_near", "maize_by_day", "thin_wet")
@@ -65,7 +67,7 @@ class ImageStatistics:
 
 
 def render_plot(folder: Path, purpose: str, family: str, number: int) -> Path:
-    """Render `FRAMES` random images of one plot and its true boxes into a .npz file, unless it exists; return its path.
+    """Render `FRAMES` random images of one plot and their true boxes into a .npz file, unless it exists; return its path.
 
     Args:
         folder: Folder of the file; created if it does not exist.
@@ -83,8 +85,11 @@ def render_plot(folder: Path, purpose: str, family: str, number: int) -> Path:
     for index, frame in enumerate(np.random.default_rng(seed).choice(len(sequence), FRAMES, replace=False)):
         image, instance, depth = sequence.left(int(frame))
         thinned = np.asarray(instance[::4, ::4]), np.asarray(depth[::4, ::4])
-        stalks, kinds, _ = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
+        pose = sequence.drive.poses[frame]
+        stalks, kinds, _ = true_boxes(sequence.plot, pose, true, *thinned)
+        behind = boxes_behind(sequence.plot, pose, true, rows_of_boxes(stalks))
         arrays |= {f"image_{index}": np.asarray(image), f"stalks_{index}": stalks, f"kinds_{index}": kinds}
+        arrays[f"behind_{index}"] = behind
     pixels_per_metre = sequence.drive.stated.focal / sequence.plot.family.rig.distance
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(path, pixels_per_metre=pixels_per_metre, **arrays)
@@ -104,6 +109,34 @@ def rows_of_boxes(stalks: np.ndarray) -> Band | None:
     order = np.argsort(stalks[:, [0, 2]].mean(axis=1))
     columns, tops, bottoms = stalks[order][:, [0, 2]].mean(axis=1), stalks[order, 1], stalks[order, 3]
     return lambda column: (float(np.interp(column, columns, tops)), float(np.interp(column, columns, bottoms)))
+
+
+def boxes_behind(plot: Plot, pose: Pose, camera: Calibration, band: Band | None) -> np.ndarray:
+    """Return the boxes of the stalks of the rows behind, which training ignores by day, within the band of the near row.
+
+    Args:
+        plot: Plot with its plants.
+        pose: Pose of the left camera.
+        camera: True calibration of the camera.
+        band: Rows of the near row's band; None if it has no stalks in view.
+
+    Returns:
+        Boxes and axes [N, 6] float32 in continuous image coordinates; empty at night, when these stalks are dark.
+    """
+    boxes = []
+    for stalk in plot.stalks:
+        if band is None or plot.family.scene.share == 0 or stalk.row <= 0:
+            continue
+        edges = outline(stalk, pose, camera, np.linspace(stalk.points[:, 2].max(), 0.0, 40)) + 0.5  # from the top
+        rows = edges[:, :, 1].mean(axis=1)
+        top, bottom = band(float(edges[:, :, 0].mean()))
+        inside = np.linspace(max(top, rows[0]), min(bottom, rows[-1]), 20)
+        if inside[0] >= inside[-1]:
+            continue
+        left, right = (np.interp(inside, rows, edges[:, side, 0]) for side in (0, 1))
+        axis = (left + right)[[0, -1]] / 2
+        boxes.append([left.min(), inside[0], right.max(), inside[-1], *axis])
+    return np.array(boxes, np.float32).reshape(-1, 6)
 
 
 def detect_stalks(
@@ -160,10 +193,11 @@ def image_statistics(path: Path, finder: Finder, name: str, is_known: bool) -> l
 def _detect_images(path: Path, finder: Finder, is_known: bool) -> Iterator[ImageStatistics]:
     with np.load(path) as data:
         for index in range(FRAMES):
-            image, truth, kinds = (data[f"{name}_{index}"] for name in ("image", "stalks", "kinds"))
+            image, truth, kinds, behind = (data[f"{name}_{index}"] for name in ("image", "stalks", "kinds", "behind"))
             pixels_per_metre = float(data["pixels_per_metre"]) if is_known else None
             stalks, scores, pooled = detect_stalks(finder, image, pixels_per_metre, rows_of_boxes(truth))
-            right, ignored = match_to_annotations(stalks, scores, truth, kinds)
+            all_kinds = np.concatenate([kinds, np.full(len(behind), UNCLEAR, kinds.dtype)])
+            right, ignored = match_to_annotations(stalks, scores, np.concatenate([truth, behind]), all_kinds)
             counted = (scores >= MIN_SCORE) & ~ignored
             f1 = f1_score(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
             yield ImageStatistics("", pooled, scores, f1, brightness_and_sharpness(image))

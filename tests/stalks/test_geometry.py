@@ -310,6 +310,21 @@ def test_stalks_of_the_row_behind_are_placed_there():
     assert pair_fault(finds, sightings, left, right, CAMERA) is None
 
 
+def test_disparities_that_agree_behind_the_row_beat_better_correlations_that_do_not():
+    """In the depths of a row, pieces of the stalk match something as similar, each at another disparity."""
+    left, right, finds = stalks_at(68, 34, 34, 34)
+    random = np.random.default_rng(0)
+    for column in COLUMNS[-3:]:
+        for row in range(0, 400, 20):
+            first = column - random.integers(46, 90)
+            right[row : row + 20, first : first + 14] = left[row : row + 20, column : column + 14]
+        there = right[:, column - 34 : column - 20]
+        there[:] = np.clip(there + random.integers(-60, 60, there.shape), 0, 255)
+    depths = [sighting.depth_m for sighting in measure_pair(finds, left, right, CAMERA)]
+    assert depths[:3] == pytest.approx([54.2 / 68] * 3, abs=0.02)
+    assert depths[3:] == pytest.approx([54.2 / 34] * 3, abs=0.04)
+
+
 def test_what_the_right_image_does_not_reach_has_no_depth():
     """The right image ends before the leftmost stalk; a match with a similar texture would put it 1.2 m away."""
     left, right, finds = stalks_at(68)

@@ -171,17 +171,20 @@ def _disparity(
     depths: tuple[float, float],
     disparity: np.ndarray | None,
 ) -> StalkDisparity:
-    """Compute the disparities of a stalk within a range of depths, m, or behind it if it clearly correlates more there.
+    """Compute the disparities of a stalk within a range of depths, m, or behind it.
 
-    See `stalk_disparity`.
+    Those behind must agree, and correlate clearly more if those within the range agree, too. See `stalk_disparity`.
     """
     behind, far, near = (float(calibration.disparity(np.array(depth))) for depth in (_BEHIND, *depths[::-1]))
+    row = strip.reference + corner[0]
     in_row = stalk_disparity(strip, corner, left, right, calibration, (far, near), disparity)
-    wanted = _CLEARLY * in_row.scores.sum()
+    agree = in_row.at(row) is not None
+    wanted = _CLEARLY * in_row.scores.sum() if agree else 0.0
     if wanted >= in_row.window_count:  # no correlation exceeds 1
         return in_row
     matched = stalk_disparity(strip, corner, left, right, calibration, (behind, far), disparity)
-    return matched if matched.scores.sum() > wanted else in_row
+    better = matched.scores.sum() > wanted and matched.at(row) is not None
+    return matched if better else in_row
 
 
 def stalk_disparity(
