@@ -18,6 +18,7 @@ DEPTHS = (0.5, 1.3)
 """Minimum and maximum depth of the stalks of a row, m."""
 _BEHIND = 4.0  # m: depth up to which stalks behind the row are matched, as by day they would be matched with nearer ones
 _CLEARLY = 1.25  # factor of the correlations behind the row to those in it: windows of a stalk also match by chance
+_MAX_TILT = math.radians(30.0)  # of a stalk: a larger one is a mismatch
 _WINDOWS = 16
 _REACH = 0.025  # m along a stalk, within which edges are measured: sheaths and nodes beyond have no effect
 
@@ -36,7 +37,7 @@ class Measurement:
         depth: Planar depth of the front surface, m.
         height: Height of the measurement above the ground, m; NaN if no ground is known.
         lean, tilt: Angles of the stalk against the vertical of the image (positive to the right) and away from the camera, rad;
-            the tilt is 0 if unknown.
+            the tilt is 0 if unknown or implausible.
         confidence: Confidence of the measurement, 0 to 1.
         both_edges_visible: True if both edges are visible around that image row. If False, the edges are extrapolated from the
             rest of the stalk, which is usually partially occluded.
@@ -113,6 +114,7 @@ def measure_stalk(
     half = 0.5 * pixels / math.cos(strip.lean)
     edges = tuple((middle + corner[1] + side * half, place + corner[0]) for side in (-1.0, 1.0))
     tilt = _tilt(matched, shift, calibration)
+    tilt = tilt if abs(tilt) < _MAX_TILT else 0.0
     diameter = diameter_mm(calibration, edges[0], edges[1], depth, strip.lean, tilt)
     # Away from the middle of the visible part, the error of the slopes adds to that of the edges.
     span = max(strip.last - strip.first, 1)
@@ -173,18 +175,18 @@ def _disparity(
 ) -> StalkDisparity:
     """Compute the disparities of a stalk within a range of depths, m, or behind it.
 
-    Those behind must agree, and correlate clearly more if those within the range agree, too. See `stalk_disparity`.
+    Those behind must agree on an upright stalk, and correlate clearly more if those within the range agree, too. See
+    `stalk_disparity`.
     """
     behind, far, near = (float(calibration.disparity(np.array(depth))) for depth in (_BEHIND, *depths[::-1]))
     row = strip.reference + corner[0]
     in_row = stalk_disparity(strip, corner, left, right, calibration, (far, near), disparity)
-    agree = in_row.at(row) is not None
-    wanted = _CLEARLY * in_row.scores.sum() if agree else 0.0
+    wanted = 0.0 if in_row.at(row) is None else _CLEARLY * in_row.scores.sum()
     if wanted >= in_row.window_count:  # no correlation exceeds 1
         return in_row
     matched = stalk_disparity(strip, corner, left, right, calibration, (behind, far), disparity)
-    better = matched.scores.sum() > wanted and matched.at(row) is not None
-    return matched if better else in_row
+    there = matched.at(row) if matched.scores.sum() > wanted else None
+    return in_row if there is None or abs(_tilt(matched, there[0], calibration)) > _MAX_TILT else matched
 
 
 def stalk_disparity(
@@ -215,7 +217,7 @@ def stalk_disparity(
 
 
 def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -> float:
-    """Return the tilt of the stalk away from the camera, rad; 0 if the matched segment is too short or the tilt implausible.
+    """Return the tilt of the stalk away from the camera, rad; 0 if the matched segment is too short.
 
     Args:
         matched: Disparities of the stalk.
@@ -226,5 +228,4 @@ def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -
         return 0.0
     first, second = index_pairs(matched.rows.size, 3)
     slopes = (matched.values[second] - matched.values[first]) / (matched.rows[second] - matched.rows[first])
-    tilt = tilt_from_disparity(median(slopes), disparity, calibration)
-    return tilt if abs(tilt) < math.radians(30.0) else 0.0
+    return tilt_from_disparity(median(slopes), disparity, calibration)
