@@ -147,13 +147,13 @@ class Learner:
         if (states is None) != (self._state_size == 0):
             raise RequestError("states are needed where a learner has a state_size, and only there")
         dtype = np.dtype(self._spec.dtype)
-        seen = self._check_array("observations", observations, (self._horizon + 1, *self._observation_shape), dtype)
+        checked = self._check_array("observations", observations, (self._horizon + 1, *self._observation_shape), dtype)
         done = self._check_array("actions", actions, (self._horizon, self._action_size), np.dtype(np.float32))
-        aim = seen[-1] if goal is None else self._check_array("goal", goal, self._observation_shape, dtype)
+        aim = checked[-1] if goal is None else self._check_array("goal", goal, self._observation_shape, dtype)
         true = np.zeros((self._horizon + 2, 1)) if states is None else states
         shape = (self._horizon + 2, max(1, self._state_size))
         episode = Episodes(
-            observations=_planar(np.concatenate([seen, aim[None]]))[None],  # type: ignore[arg-type]
+            observations=_planar(np.concatenate([checked, aim[None]]))[None],  # type: ignore[arg-type]
             states=self._check_array("states", true, shape, np.dtype(np.float32))[None],  # type: ignore[arg-type]
             actions=np.clip(done, -1.0, 1.0)[None],  # type: ignore[arg-type]
         )
@@ -201,10 +201,10 @@ class Learner:
             RequestError: A shape or dtype is wrong, or a value is not finite.
         """
         dtype = np.dtype(self._spec.dtype)
-        seen, aim = (
+        image, aim = (
             self._check_array(*pair, self._observation_shape, dtype) for pair in (("observation", observation), ("goal", goal))
         )
-        return np.asarray(self._act(self._train_state, _planar(seen)[None], _planar(aim)[None])[0])
+        return np.asarray(self._act(self._train_state, _planar(image)[None], _planar(aim)[None])[0])
 
     @functools.cached_property
     def _act(self) -> Callable[..., jax.Array]:

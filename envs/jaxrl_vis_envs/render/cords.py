@@ -173,8 +173,8 @@ def _wrap(scene: Any, data: Any, piece: Piece) -> _Wrap:
     if not piece.is_ball:
         # Position along the cylinder's axis, proportional to the path length in the plane.
         before, after = _norm(begin[:2] - points[0, :2]), _norm(end[:2] - points[-1, :2])
-        way = jnp.maximum(before + length + after, _TINY)
-        low, high = (begin[2] + (end[2] - begin[2]) * part / way for part in (before, before + length))
+        path = jnp.maximum(before + length + after, _TINY)
+        low, high = (begin[2] + (end[2] - begin[2]) * part / path for part in (before, before + length))
         length = jnp.sqrt(jnp.square(length) + jnp.square(high - low))
         points = points.at[:, 2].set(jnp.linspace(low, high, tendons.ARC + 1))
     meets = meets & (_norm(begin) > _TINY) & (_norm(end) > _TINY)

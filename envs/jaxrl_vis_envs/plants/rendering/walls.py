@@ -85,8 +85,8 @@ def _sheet(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, texels: float
         wave = np.where(inside < 1.0, np.sin(2 * math.pi * inside), 0.0)
     shade = 1.0 + rng.uniform(0.05, 0.6) * wave
     if rng.random() < 0.6:  # joints of the sheets
-        each = rng.uniform(0.5, 1.5)
-        shade = shade * np.where(np.mod(across, each) < max(0.008, 1.0 / texels), rng.uniform(0.1, 0.6), 1.0)
+        sheet_width = rng.uniform(0.5, 1.5)
+        shade = shade * np.where(np.mod(across, sheet_width) < max(0.008, 1.0 / texels), rng.uniform(0.1, 0.6), 1.0)
     if rng.random() < 0.4:
         shade = shade * (1.0 - rng.uniform(0.0, 0.7) * (along / along.max()) ** 2)  # the curve turns away from the light
     return _solid(sample_colour(rng), np.maximum(shade, 0.03) * _weather(rng, shade.shape, rng.uniform(0.0, 0.25)))

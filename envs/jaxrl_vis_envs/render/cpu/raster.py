@@ -141,8 +141,8 @@ def _by_image(bare: Scene, layout: blocks.Layout) -> Callable[[dict, _Views], tu
         count = views.depth.shape[0]
         size = max(size for size in range(1, _IMAGES + 1) if count % size == 0)
         lists = jax.tree.map(lambda leaf: leaf.reshape(count // size, size, *leaf.shape[1:]), views)
-        found = jax.lax.map(lambda views: _search_list(bare.replace(**tables), layout, views), lists)
-        return jax.tree.map(lambda plane: plane.reshape(count, -1), found)
+        planes = jax.lax.map(lambda views: _search_list(bare.replace(**tables), layout, views), lists)
+        return jax.tree.map(lambda plane: plane.reshape(count, -1), planes)
 
     @search.def_vmap
     def _(size: int, in_batched: list, tables: dict, views: _Views) -> tuple[tuple, tuple]:
@@ -152,10 +152,10 @@ def _by_image(bare: Scene, layout: blocks.Layout) -> Callable[[dict, _Views], tu
         views = jax.tree.map(spread, views, in_batched[1])
         if any(jax.tree.leaves(in_batched[0])):  # meshes differ between images
             tables = jax.tree.map(spread, tables, in_batched[0])
-            return jax.lax.map(lambda given: search(*given), (tables, views)), (True, True)
+            return jax.lax.map(lambda batch: search(*batch), (tables, views)), (True, True)
         merged = jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), views)
-        found = search(tables, merged)
-        return jax.tree.map(lambda plane: plane.reshape(size, -1, plane.shape[-1]), found), (True, True)
+        planes = search(tables, merged)
+        return jax.tree.map(lambda plane: plane.reshape(size, -1, plane.shape[-1]), planes), (True, True)
 
     return search
 
@@ -177,16 +177,16 @@ def _search_list(scene: Scene, layout: blocks.Layout, views: _Views) -> tuple[ja
     places[(layout.rows * scene.width + layout.columns)[inside]] = np.flatnonzero(inside)
 
     def see(lens: dict[str, jax.Array], unit: shapes.UnitShapes, depth: jax.Array) -> tuple:
-        seen = scene.replace(**lens)
-        rays = camera.pixel_rays(seen, layout.rows.ravel(), layout.columns.ravel())
-        visible = triangles.bounded(seen, triangles.opaque_bounds(seen, unit), rays, depth)
+        own_scene = scene.replace(**lens)
+        rays = camera.pixel_rays(own_scene, layout.rows.ravel(), layout.columns.ravel())
+        visible = triangles.bounded(own_scene, triangles.opaque_bounds(own_scene, unit), rays, depth)
         slopes, shifts = [], []
         for length, middle, pitch, sign in zip(
-            (scene.width, scene.height), camera.lens(seen), camera.pixel_pitch(seen), (1.0, -1.0), strict=False
+            (scene.width, scene.height), camera.lens(own_scene), camera.pixel_pitch(own_scene), (1.0, -1.0), strict=False
         ):
             slopes.append(sign / pitch)  # rows are counted from the top
             shifts.append(0.5 * (length - 1) - slopes[-1] * middle)
-        return visible, jnp.stack([*slopes, *shifts, seen.znear]), rays
+        return visible, jnp.stack([*slopes, *shifts, own_scene.znear]), rays
 
     visible, lens, rays = jax.vmap(see)(*views)
     ends = jnp.cumsum(visible.ravel().astype(jnp.int32), dtype=jnp.int32)

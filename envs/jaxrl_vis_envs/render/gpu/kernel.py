@@ -356,9 +356,9 @@ def nearest_primitives(scene: Scene, unit: shapes.UnitShapes, interpret: bool = 
 
 def _search_kernel(*refs, scene: Scene, tile: tuple[int, int]):
     count = len(_Refs._fields)
-    found = _search_tile(_Refs(*refs[:count]), scene, tile)
-    for out, plane in zip(refs[count:], found.best, strict=True):
-        plgpu.store(out.at[found.row * scene.width + found.column], plane, mask=found.inside)
+    result = _search_tile(_Refs(*refs[:count]), scene, tile)
+    for out, plane in zip(refs[count:], result.best, strict=True):
+        plgpu.store(out.at[result.row * scene.width + result.column], plane, mask=result.inside)
 
 
 def _inputs(scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> _Refs:

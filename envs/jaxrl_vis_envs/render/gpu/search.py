@@ -62,8 +62,8 @@ def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays, interpret: bool =
         key, row = raycast.nearest_row(scene, unit, rays)
     else:
         key = raycast.nearest_key(scene, unit, rays)
-    found = nearest_triangle(scene, unit, rays, raycast.decode(scene, key, row)[0], interpret)
-    return jax.tree.map(lambda plane: plane[None], blocks.add_triangles(scene, key, row, found))
+    nearest = nearest_triangle(scene, unit, rays, raycast.decode(scene, key, row)[0], interpret)
+    return jax.tree.map(lambda plane: plane[None], blocks.add_triangles(scene, key, row, nearest))
 
 
 def nearest_triangle(

@@ -220,13 +220,13 @@ def _found(state: _State, any_hit: bool) -> list[jax.Array]:
 
 
 def _begin(refs: Refs, ray: jax.Array) -> tuple[_Task, _State]:
-    """Return the state of lanes that begin with rays, given by their numbers [L], -1 for none."""
-    given = ray >= 0
+    """Return the state of lanes that begin with rays, valid by their numbers [L], -1 for none."""
+    valid = ray >= 0
     place = jnp.maximum(ray, 0)
-    rows = tuple(_gather(refs.rows, given, number, place) for number in range(refs.rows.shape[0]))
-    start, direction = (tuple(_gather(ref, given, axis, place) for axis in range(3)) for ref in (refs.start, refs.direction))
-    nearest, farthest = _gather(refs.nearest, given, place), _gather(refs.farthest, given, place)
-    word, words = (_gather(refs.span, given, rows[0], side) for side in range(2))
+    rows = tuple(_gather(refs.rows, valid, number, place) for number in range(refs.rows.shape[0]))
+    start, direction = (tuple(_gather(ref, valid, axis, place) for axis in range(3)) for ref in (refs.start, refs.direction))
+    nearest, farthest = _gather(refs.nearest, valid, place), _gather(refs.farthest, valid, place)
+    word, words = (_gather(refs.span, valid, rows[0], side) for side in range(2))
     zero, none = jnp.zeros(ray.shape, jnp.float32), jnp.zeros(ray.shape, jnp.int32)
     state = _State(word, none, none, none, none, _Ray(*((zero,) * 3,) * 4), farthest, none - 1, none)
     return _Task(ray, rows, start, direction, nearest, words), state

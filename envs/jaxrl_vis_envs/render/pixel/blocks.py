@@ -172,16 +172,16 @@ def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> Nearest:
     return scan(with_triangles, rays, key, row)
 
 
-def add_triangles(scene: Scene, key: jax.Array, row: jax.Array | None, found: tuple) -> Nearest:
+def add_triangles(scene: Scene, key: jax.Array, row: jax.Array | None, nearest: tuple) -> Nearest:
     """Merge the nearest primitives with the nearest triangles in front of them.
 
     Args:
         scene: The scene.
         key: [P] int32, keys of the nearest primitives.
         row: [P] int32, their rows if the scene has separate rows, else None.
-        found: Nearest triangles in front of them, from `triangles.nearest_triangle`.
+        nearest: Nearest triangles in front of them, from `triangles.nearest_triangle`.
     """
-    depth, triangle, owner = found
+    depth, triangle, owner = nearest
     mask = raycast.code_mask(scene)
     triangle_key = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | (owner & mask)
     is_triangle = triangle >= 0

@@ -63,14 +63,14 @@ def opaque_bounds(scene: Scene, unit: shapes.UnitShapes) -> Bounds:
     """Return the bounds of all clusters; inverted for transparent objects and for clusters that are not visible."""
     middle, facing = _in_camera(scene, unit)
     radius, sine = scene.clusters[:, 3], scene.clusters[:, 7]
-    seen = camera.sphere_sides(scene, middle, radius)
+    extents = camera.sphere_sides(scene, middle, radius)
     # Most clusters of a fine mesh lie between the middles of pixels: their bounds are rounded to those.
     middles = camera.lens(scene)
     sides = []
     for axis, (count, pitch) in enumerate(zip((scene.width, scene.height), camera.pixel_pitch(scene), strict=True)):
         first = middles[axis] - 0.5 * (count - 1) * pitch
-        low = jnp.ceil((seen[:, 2 * axis] - first) / pitch - _ROUNDING)
-        high = jnp.floor((seen[:, 2 * axis + 1] - first) / pitch + _ROUNDING)
+        low = jnp.ceil((extents[:, 2 * axis] - first) / pitch - _ROUNDING)
+        high = jnp.floor((extents[:, 2 * axis + 1] - first) / pitch + _ROUNDING)
         sides += [jnp.where(low <= high, first + low * pitch, camera.INFINITE), first + high * pitch]
     if scene.projection == "orthographic":
         is_front = -facing[:, 2] < sine

@@ -210,16 +210,16 @@ def section_proposals(
     Returns:
         Proposals [P, 6], their bands [P] int32, and their validity [P] bool, False for padding; P as for `select_proposals`.
     """
-    bands, each = anchors.shape[:2]
-    count = min(max(settings.candidates // bands, 1), each)
-    scores, places = jax.lax.top_k(logits.reshape(bands, each), count)
+    bands, anchors_per_band = anchors.shape[:2]
+    count = min(max(settings.candidates // bands, 1), anchors_per_band)
+    scores, places = jax.lax.top_k(logits.reshape(bands, anchors_per_band), count)
 
     def select_in_band(scores, places, offsets, anchors):
         stalks = decode_sections(offsets[places], anchors[places])
         selected = non_maximum_suppression(strip_overlap(stalks, stalks, 4), scores, settings.proposal_threshold)
         return stalks, jnp.where(selected & (stalks[:, 2] - stalks[:, 0] > 2.0), scores, -jnp.inf)
 
-    stalks, scores = jax.vmap(select_in_band)(scores, places, offsets.reshape(bands, each, 6), anchors)
+    stalks, scores = jax.vmap(select_in_band)(scores, places, offsets.reshape(bands, anchors_per_band, 6), anchors)
     best, places = jax.lax.top_k(scores.reshape(-1), min(settings.proposals, bands * count))
     return stalks.reshape(-1, 6)[places], places // count, jnp.isfinite(best)
 

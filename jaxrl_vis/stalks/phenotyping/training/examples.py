@@ -97,8 +97,8 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         example = make_example(image, pixels_per_metre, stalks, kinds, *how)
         if settings.section:
             scale = image.shape[0] / example.image.shape[0], image.shape[1] / example.image.shape[1]
-            pose, seen = sequence.drive.poses[frame], np.asarray(instance)
-            edges = synthetic_edges(sequence.plot, pose, true, seen, example.image.shape[:2], scale)
+            pose, instances = sequence.drive.poses[frame], np.asarray(instance)
+            edges = synthetic_edges(sequence.plot, pose, true, instances, example.image.shape[:2], scale)
             example = dataclasses.replace(example, edges=edges)
         if is_daytime:
             # Lenses and scales differ between plots, and each shape of crops would need a compilation.

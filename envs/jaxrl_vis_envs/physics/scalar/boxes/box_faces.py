@@ -183,7 +183,7 @@ def _candidates(centre: Vector, edges: tuple[Vector, Vector], half_size: Vector)
                 rest = sign * half_size[axis] - centre[axis] - end * edges[1 - edge][axis]
                 place = jnp.where(is_along, 2.0, rest * inverse)
                 places.append((place, end) if edge == 0 else (end, place))
-    found = []
+    candidates = []
     for x, y in places:
         # Crossings and corners lie on the edges up to rounding.
         inside = [_abs(part) <= 1.0 + 1e-5 for part in (x, y) if not isinstance(part, float)]
@@ -193,8 +193,8 @@ def _candidates(centre: Vector, edges: tuple[Vector, Vector], half_size: Vector)
         is_inside = inside[0]
         for more in inside[1:]:
             is_inside = is_inside & more
-        found.append(_Candidate(x, y, is_inside))
-    return found
+        candidates.append(_Candidate(x, y, is_inside))
+    return candidates
 
 
 def _select_candidate(contacts: LaneContacts, candidates: list[_Candidate]) -> tuple[Any, Any, Any]:
