@@ -116,8 +116,9 @@ def score_plot(
     tracks, path = track_stalks(frames, drive.odometry, drive.stated)
     owners: list[list[int | None]] = []
     scored_detections: list[tuple[float, float]] = []
-    for (detections, selected, stalks), sightings in zip(outcomes, frames):
-        behind = {place for place, sighting in zip(selected, sightings) if path.is_behind_row(sighting)}
+    all_behind = {sighting for track in tracks if path.is_behind_row(track) for sighting in track.sightings}
+    for frame, (detections, selected, stalks) in enumerate(outcomes):
+        behind = {place for number, place in enumerate(selected) if (frame, number) in all_behind}
         others = [place for place in range(len(detections)) if place not in behind]
         matched, scored = match_detections([detections[place] for place in others], stalks)
         owner = dict(zip(others, matched))

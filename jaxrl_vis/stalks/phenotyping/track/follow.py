@@ -83,9 +83,9 @@ class RobotPath:
     seen_fraction: float = 1.0
     row_depth: float = _USUAL_DEPTH
 
-    def is_behind_row(self, sighting: Sighting) -> bool:
-        """Return True if stereo places a sighting further behind the row than a counted stalk may be."""
-        return sighting.depth_m is not None and sighting.depth_m - self.row_depth > Gates.max_row_offset
+    def is_behind_row(self, track: "Track") -> bool:
+        """Return True if stereo places a track further behind the row than a counted stalk may be."""
+        return track.depth_m - self.row_depth > Gates.max_row_offset
 
 
 @dataclasses.dataclass
@@ -146,12 +146,10 @@ def track_stalks(
     row = [sighting.depth_m for sightings in frames for sighting in sightings if sighting.depth_m is not None]
     usual = near_row_depth(row) if row else _USUAL_DEPTH
     for frame, sightings in enumerate(frames):
-        view = _PairView.of(sightings, calibration, usual)
+        view = _PairView.of(sightings, calibration, usual, usual + gates.max_row_offset)
         positions[frame] = driven[frame] + correction
         pairs = _assign(tracks, view, positions[frame], gates)
-        moves = [
-            tracks[track].locate()[0] - view.along[new] - positions[frame] for track, new in pairs if view.is_measured[new]
-        ]
+        moves = [tracks[track].locate()[0] - view.along[new] - positions[frame] for track, new in pairs if view.is_in_row[new]]
         if len(moves) >= 3:
             correction += float(np.median(moves))
             positions[frame] = driven[frame] + correction
@@ -204,8 +202,9 @@ class _PairView:
         rays: Tangent of the horizontal angle at which the left camera sees the stalk.
         along: Position along the row relative to the midpoint of the cameras, m; at the usual depth if not measured.
         depth: Depth of the front surface, m; NaN if not measured.
-        is_measured: True if position and depth were measured.
-        is_candidate: True if the sighting may be a stalk of the row.
+        is_measured: True if position and depth were measured; behind the row, positions follow from the depth.
+        is_in_row: True if they were measured, and not behind the row.
+        is_candidate: True if the sighting may be a stalk of the row, or of one behind.
         foot_offset: Distance along the row from the stalk's foot to its measurement, m; 0 if its height is unknown.
         half: Half the baseline (scalar), m.
         usual: Depth of the row over all pairs (scalar), m.
@@ -215,23 +214,28 @@ class _PairView:
     along: np.ndarray
     depth: np.ndarray
     is_measured: np.ndarray
+    is_in_row: np.ndarray
     is_candidate: np.ndarray
     foot_offset: np.ndarray
     half: float
     usual: float
 
     @classmethod
-    def of(cls, sightings: list[Sighting], calibration: Calibration, usual: float) -> "_PairView":
+    def of(cls, sightings: list[Sighting], calibration: Calibration, usual: float, farthest: float) -> "_PairView":
+        """Compute the view of a pair from its sightings, the usual depth of the row, and the greatest of its stalks, m."""
+        half = 0.5 * calibration.baseline
         rays = np.array([(sighting.column - calibration.centre[0]) / calibration.focal for sighting in sightings])
         along = np.array([math.nan if sighting.along_m is None else sighting.along_m for sighting in sightings])
         depth = np.array([math.nan if sighting.depth_m is None else sighting.depth_m for sighting in sightings])
+        # Stalks behind the row are tracked, too, so that those of their sightings that have no depth are known to be theirs.
+        behind = depth > farthest
+        along = np.where(behind & np.isnan(along), rays * depth - half, along)
         known = np.isfinite(along) & np.isfinite(depth)
-        # A depth without a position: not a stalk of the row.
-        elsewhere = np.array([sighting.depth_m is not None and sighting.along_m is None for sighting in sightings], bool)
+        elsewhere = np.isfinite(depth) & ~known  # before the row
         over = np.array([_lean_offset(sighting) for sighting in sightings])
-        half = 0.5 * calibration.baseline
         along = np.where(known, along, rays * usual - half)
-        return cls(rays, along, depth, known, ~elsewhere & _are_distinct(sightings), over, half, usual)
+        candidates = ~elsewhere & _are_distinct(sightings)
+        return cls(rays, along, depth, known, known & ~behind, candidates, over, half, usual)
 
     def along_at(self, depth: float) -> np.ndarray:
         """Return the positions along the row [N], m, assuming a ``depth`` in m; the usual depth if NaN."""
