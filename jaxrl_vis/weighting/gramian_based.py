@@ -173,9 +173,12 @@ def cagrad(radius: float = 0.5, **options: Unpack[Options]) -> Weighting:
             return mean
         inside, length = solvers.conflict_averse(gramian, radius)
         greatest = jnp.max(jnp.diagonal(gramian))
-        of_mean = jnp.sqrt(jnp.maximum(solvers.quadratic(gramian, mean) / jnp.where(greatest > 0.0, greatest, 1.0), 0.0))
-        # If the hull contains 0, no direction helps all losses: the paper's step is undefined; return 0 instead.
-        is_some = length > 10.0 * jnp.finfo(gramian.dtype).eps ** 0.5
+        scaled = gramian / jnp.where(greatest > 0.0, greatest, 1.0)
+        of_mean = jnp.sqrt(jnp.maximum(solvers.quadratic(scaled, mean), 0.0))
+        # If the hull contains 0, no direction helps all losses: the paper's step is undefined; return 0 instead. The hull then
+        # has a point much shorter than the gradients that it combines, which may themselves be short.
+        combined = jnp.sqrt(jnp.dot(inside**2, jnp.diagonal(scaled)))
+        is_some = length > 10.0 * jnp.finfo(gramian.dtype).eps ** 0.5 * combined
         return jnp.where(is_some, mean + radius * of_mean / jnp.where(is_some, length, 1.0) * inside, 0.0)
 
     return of_gramian("cagrad", _plain(weights), **options)
@@ -194,13 +197,17 @@ def imtl_g(**options: Unpack[Options]) -> Weighting:
     """
 
     def weights(gramian: jax.Array) -> jax.Array:
-        raw = jnp.dot(
-            solvers.pseudo_inverse(gramian),
-            jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0)),
-            precision=jax.lax.Precision.HIGHEST,
-        )
+        highest = jax.lax.Precision.HIGHEST
+        eps = jnp.finfo(gramian.dtype).eps
+        # Independent gradients are inverted at unit norm, so that short ones are not taken for dependent ones.
+        unit, lengths = solvers.unit_gramian(gramian)
+        values = jnp.linalg.eigvalsh(unit)
+        independent = jnp.sum(solvers.pseudo_inverse(unit), axis=1) / lengths
+        norms = jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
+        dependent = jnp.dot(solvers.pseudo_inverse(gramian), norms, precision=highest)
+        raw = jnp.where(values[0] > 16.0 * len(gramian) * eps * values[-1], independent, dependent)
         total = jnp.sum(raw)
-        is_some = jnp.abs(total) > 10.0 * jnp.finfo(gramian.dtype).eps * jnp.sum(jnp.abs(raw))
+        is_some = jnp.abs(total) > 10.0 * eps * jnp.sum(jnp.abs(raw))
         return jnp.where(is_some, raw / jnp.where(is_some, total, 1.0), 0.0)
 
     return of_gramian("imtl_g", _plain(weights), **options)
@@ -260,7 +267,8 @@ def aligned_mtl(**options: Unpack[Options]) -> Weighting:
 
     With eigenvalues l and eigenvectors V of the Gramian, weights are the row means of sqrt(l_min) V l^(-1/2) V^T, over the
     nonzero eigenvalues: all principal components of the gradients are rescaled to the norm of the smallest, which makes the
-    step stable (algorithm 1). Closed form. Steps are as short as the smallest component.
+    step stable (algorithm 1). Closed form. Steps are as short as the smallest component. Components shorter than sqrt(K eps)
+    times the longest, in float32 about a thousandth, count as 0.
 
     Args:
         options: See `Options`.

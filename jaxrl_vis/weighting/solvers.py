@@ -24,12 +24,12 @@ _NEWTON_STEPS = 60
 _HALVINGS = 16
 
 
-def unit_gramian(gramian: jax.Array, min_length: float | None = None) -> tuple[jax.Array, jax.Array]:
+def unit_gramian(gramian: jax.Array, min_length: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
     """Scale gradients to unit norm.
 
     Args:
         gramian: [K, K] float.
-        min_length: Minimum norm by which gradients are divided, relative to the largest norm; None for the machine epsilon.
+        min_length: [K] minimum norms by which gradients are divided, relative to the largest; None for the machine epsilon.
 
     Returns:
         [K, K] Gramian of the scaled gradients; [K] norms of the gradients relative to the largest norm, and not less than
@@ -106,7 +106,7 @@ def _pivot(matrix: jax.Array, target: jax.Array, free: jax.Array) -> tuple[jax.A
 
 
 def min_norm(
-    gramian: jax.Array, free: jax.Array | None = None, passes: int = 3, min_length: float | None = None
+    gramian: jax.Array, free: jax.Array | None = None, passes: int = 3, min_length: jax.Array | None = None
 ) -> tuple[jax.Array, jax.Array]:
     """Compute the weights w >= 0, of sum 1, that minimise w^T G w.
 
@@ -181,9 +181,11 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
     def evaluate(t: jax.Array, free: jax.Array, passes: int = 1) -> tuple[jax.Array, jax.Array, jax.Array]:
         fraction = t / ball
         shifted = scaled + fraction * (to_mean[:, None] + to_mean[None, :]) + fraction**2 * squared
-        # Only the rounding errors of these sums would be left of a gradient that is shifted close to 0. This minimum norm
-        # keeps them below the ridge that `nonnegative` adds.
-        weights, free = min_norm(shifted, free, passes, min_length=float(eps) ** (1 / 6))
+        # Of a gradient that is shifted close to 0, only the rounding errors of these sums are left. This minimum norm, relative
+        # to their terms, keeps them below the ridge that `nonnegative` adds.
+        terms = jnp.diagonal(scaled) + 2.0 * fraction * jnp.abs(to_mean) + fraction**2 * squared
+        least = eps ** (1 / 6) * jnp.sqrt(terms / jnp.maximum(jnp.max(jnp.diagonal(shifted)), eps**2))
+        weights, free = min_norm(shifted, free, passes, min_length=jnp.maximum(least, eps))
         return weights, jnp.sqrt(jnp.maximum(quadratic(scaled, weights), 0.0)), free
 
     def step(state: _Bracket) -> _Bracket:

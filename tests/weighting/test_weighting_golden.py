@@ -421,3 +421,22 @@ def test_gramians_of_bfloat16_gradients_are_summed_in_float32() -> None:
     exact = rows.astype(np.float64) @ rows.astype(np.float64).T
     assert found.dtype in (jnp.float32, jnp.float64)
     np.testing.assert_allclose(found, exact, rtol=1e-5, atol=1e-3)
+
+
+ON_SPREAD = ("mgda", "upgrad", "dualproj", "cagrad", "imtl_g", "nash_mtl", "fairgrad", "config", "pcgrad", "gradvac")
+
+
+@pytest.mark.parametrize("name", ON_SPREAD)
+@pytest.mark.parametrize("spread", [1e2, 1e4, 1e6])
+def test_gradients_of_many_lengths_are_as_accurate_in_float32(name: str, spread: float) -> None:
+    """Regression test: cagrad took no step when one gradient was 300 times longer than another, imtl_g a wrong one at 3,000."""
+    weighting = jw.make_weighting(name)
+    rows = np.random.default_rng(1).normal(size=(3, 50)) + 0.3
+    rows *= spread ** -np.array([[0.0], [0.6], [1.0]])
+    steps = []
+    for dtype in (np.float32, np.float64):
+        losses = {each: jnp.ones((), dtype) for each in NAMES}
+        found, _, _ = jax.jit(weighting.update)(losses, jnp.asarray((rows @ rows.T).astype(dtype)), weighting.init(NAMES))
+        steps.append(rows.T @ np.array([found[each] for each in NAMES], np.float64))
+    assert np.linalg.norm(steps[1]) > 0.0
+    assert np.linalg.norm(steps[0] - steps[1]) < 1e-3 * np.linalg.norm(steps[1])
