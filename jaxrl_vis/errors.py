@@ -4,7 +4,7 @@ import signal
 
 from jaxrl_vis_envs.names import nearest
 
-__all__ = ["NonFiniteError", "RequestError", "StorageError", "Terminated", "WorkerError", "nearest"]
+__all__ = ["NonFiniteError", "RequestError", "StorageError", "Terminated", "WorkerError", "is_out_of_memory", "nearest"]
 
 
 class RequestError(ValueError):
@@ -38,3 +38,9 @@ class Terminated(SystemExit):
 
 class WorkerError(RuntimeError):
     """Worker process killed externally. The message is one line: the cause and the remedy. The command line exits with 1."""
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return True for an error of Python or JAX because the memory of the machine or of a device ran out."""
+    # JAX's class is compared by name, so that JAX need not be imported.
+    return isinstance(error, MemoryError) or (type(error).__name__ == "JaxRuntimeError" and "RESOURCE_EXHAUSTED" in str(error))

@@ -20,7 +20,15 @@ import jaxrl_vis
 from jaxrl_vis.cli import audit, bench, doctor, encoder, envs, figure, search, sweep, train
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.cli.trained import dataset, eval, export, play, push, verify
-from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, WorkerError, nearest
+from jaxrl_vis.errors import (
+    NonFiniteError,
+    RequestError,
+    StorageError,
+    Terminated,
+    WorkerError,
+    is_out_of_memory,
+    nearest,
+)
 from jaxrl_vis.host import distributed
 from jaxrl_vis.host.streams import SafeStream, detach_broken_streams, reserve_standard_files, safe_streams
 from jaxrl_vis.run.signals import Ending, signal_name
@@ -44,6 +52,10 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {  # without those of `
     "search": (search.Search, search.run),
 }
 
+_OUT_OF_MEMORY = (
+    "memory of the device or machine ran out. End other programs that use it (nvidia-smi lists those on a GPU), or use less: "
+    "fewer --seeds, --num-envs, --replay-transitions or --workers, a smaller --batch-size. Saved files are good"
+)
 # Exit statuses of errors reported in one line.
 _STATUS: dict[type[Exception], int] = {RequestError: 2, StorageError: 1, WorkerError: 1, NonFiniteError: 4}
 # Commands whose output is their result; the others write files, and print messages about them.
@@ -113,6 +125,9 @@ def _run_with_status(argv: Sequence[str], ending: Ending) -> int:
         if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:  # from wherever a path was first used
             print(f"{PROGRAM}: {str(error.filename)[:80]}... cannot be used ({error.strerror})", file=sys.stderr)
             return _STATUS[RequestError]
+        if is_out_of_memory(error) and not distributed.is_multi_process():
+            print(f"{PROGRAM}: {_OUT_OF_MEMORY}", file=sys.stderr)
+            return 1
         if not distributed.is_multi_process():
             raise
         traceback.print_exc()

@@ -23,7 +23,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, TypeVar
 
-from jaxrl_vis.errors import RequestError, WorkerError
+from jaxrl_vis.errors import RequestError, WorkerError, is_out_of_memory
 from jaxrl_vis.host.files import is_count, read_json, write_atomically
 from jaxrl_vis.run.signals import obey_parent_only, shielded_children
 from jaxrl_vis_envs.cores import num_cores
@@ -93,7 +93,7 @@ def worker_pool(workers: int) -> Iterator[UnorderedMap]:
         workers: Number of processes; 1 or less for this one.
 
     Raises:
-        WorkerError: One was killed from outside, most likely because memory ran out.
+        WorkerError: One was killed from outside, most likely because memory ran out, or memory of a device ran out.
     """
     if workers < 2:
         yield lambda function, arguments: map(function, arguments)
@@ -127,10 +127,12 @@ def worker_pool(workers: int) -> Iterator[UnorderedMap]:
         raise WorkerError(
             f"one of {workers} processes was killed from outside, most likely because memory ran out: use fewer --workers"
         ) from error
-    except BaseException:
+    except BaseException as error:
         for child in set(multiprocessing.active_children()) - others:
             child.kill()
         pool.shutdown(cancel_futures=True)
+        if is_out_of_memory(error):
+            raise WorkerError(f"memory ran out in one of {workers} processes, which share it: use fewer --workers") from error
         raise
     pool.shutdown()
 

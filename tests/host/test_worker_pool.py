@@ -16,6 +16,7 @@ from types import ModuleType
 
 import pytest
 
+from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError, Terminated, WorkerError
 from jaxrl_vis.host import devices
 from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all, map_unordered
@@ -44,6 +45,12 @@ def broken(number: int) -> Record:
     if number == 2:
         raise ValueError(f"number {number} is broken")
     return {"square": number * number}
+
+
+def greedy(number: int) -> Record:
+    import jax.numpy as jnp
+
+    return {"total": float(jnp.zeros(10**14 + number, jnp.int8).sum())}  # 100 TB
 
 
 def slow(number: int) -> Record:
@@ -95,6 +102,18 @@ def test_what_goes_wrong_in_a_process_is_reported():
     with pytest.raises(WorkerError, match="was killed from outside"):
         evaluate_all(killed, range(3), 2, results.__setitem__)
     assert not set(threading.enumerate()) - before
+
+
+def test_memory_that_runs_out_on_a_device_is_one_line(monkeypatch, capsys):
+    """Regression test: a traceback of JAX came out of `phenotype eval --workers 10` where other programs used the GPU, too."""
+    before = set(multiprocessing.active_children())
+    with pytest.raises(WorkerError, match="memory ran out in one of 2 processes.*use fewer --workers"):
+        evaluate_all(greedy, range(2), 2, {}.__setitem__)
+    assert not set(multiprocessing.active_children()) - before
+    monkeypatch.setitem(cli.COMMANDS, "envs", (cli.COMMANDS["envs"][0], lambda _: greedy(0)))
+    assert cli.main(["envs"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("jaxrl-vis: memory of the device") and error.count("\n") == 1
 
 
 def test_signals_to_the_whole_group_do_not_reach_processes():
