@@ -44,7 +44,7 @@ class PlotScore:
             compilation; NaN for a single pair.
         thesis: Score of the thesis's methods on the same detections; None if they were not evaluated.
         detections: Score of each detection, and 1 for a true or 0 for a false positive, [K, 2] float64; matches of mostly
-            occluded stalks are left out, and so are detections that stereo places behind the row.
+            occluded stalks are left out, and so are those of stalks that stereo places behind the row.
         stalks: Number of detectable stalks (ground-truth positives), summed over all pairs.
     """
 

@@ -19,33 +19,16 @@ _USUAL_DEPTH = 0.8  # m, if no depth was measured
 _SOLID = 0.6  # minimum distance of two stalks, as a fraction of that at which they touch
 _MAX_LEAN = 25.0  # degrees: a larger lean is a measurement error
 _FORBIDDEN_COST = 1e3  # cost of an assignment outside the gates
-
-
-@dataclasses.dataclass(frozen=True)
-class Gates:
-    """Gates (thresholds) of the tracker, lengths in m.
-
-    Attributes:
-        along: Maximum distance along the row between a track and a sighting assigned to it.
-        depth: Maximum difference of their depths.
-        merge: Maximum distance along the row between two tracks of one stalk, which are merged.
-        merge_across_depths: The same for tracks of different depth, with the rays of one evaluated at the depth of the other.
-        max_shared: Maximum fraction of the pairs of the shorter track in which both are seen, to merge them.
-        max_row_offset: Maximum difference between the depth of a counted stalk and that of the row.
-        min_fraction: Minimum fraction of the pairs with the stalk in view that must show it to count it.
-        min_pairs: Minimum number of pairs that must show it, unless fewer have it in view.
-        end_margin: Maximum distance of a counted stalk's foot beyond the ends of the path.
-    """
-
-    along: float = 0.018
-    depth: float = 0.05
-    merge: float = 0.015
-    merge_across_depths: float = 0.005
-    max_shared: float = 0.34
-    max_row_offset: float = 0.2
-    min_fraction: float = 0.3
-    min_pairs: int = 2
-    end_margin: float = 0.01
+# Gates of the tracker, lengths in m.
+_ALONG = 0.018  # maximum distance along the row between a track and a sighting assigned to it
+_DEPTH = 0.05  # maximum difference of their depths
+_MERGE = 0.015  # maximum distance along the row between two tracks of one stalk, which are merged
+_MERGE_ACROSS_DEPTHS = 0.005  # the same for tracks of different depth, with the rays of one evaluated at the depth of the other
+_MAX_SHARED = 0.34  # maximum fraction of the pairs of the shorter track in which both are seen, to merge them
+_MAX_ROW_OFFSET = 0.2  # maximum difference between the depth of a counted stalk and that of the row
+_MIN_FRACTION = 0.3  # minimum fraction of the pairs with the stalk in view that must show it to count it
+_MIN_PAIRS = 2  # minimum number of pairs that must show it, unless fewer have it in view
+_END_MARGIN = 0.01  # maximum distance of a counted stalk's foot beyond the ends of the path
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +68,7 @@ class RobotPath:
 
     def is_behind_row(self, track: "Track") -> bool:
         """Return True if stereo places a track further behind the row than a counted stalk may be."""
-        return track.depth_m - self.row_depth > Gates.max_row_offset
+        return track.depth_m - self.row_depth > _MAX_ROW_OFFSET
 
 
 @dataclasses.dataclass
@@ -124,7 +107,6 @@ def track_stalks(
     frames: list[list[Sighting]],
     distances: np.ndarray,
     calibration: Calibration,
-    gates: Gates = Gates(),
     columns: tuple[float, float] | None = None,
 ) -> tuple[list[Track], RobotPath]:
     """Track the stalks of a plot.
@@ -133,7 +115,6 @@ def track_stalks(
         frames: Sightings of each pair, in driving order.
         distances: Distance driven [F] float64 by odometry, m; increasing if the cameras moved to their own right.
         calibration: Calibration of the cameras.
-        gates: Thresholds of the tracker.
         columns: Half-open range of image columns without black borders; None for all.
 
     Returns:
@@ -146,14 +127,14 @@ def track_stalks(
     row = [sighting.depth_m for sightings in frames for sighting in sightings if sighting.depth_m is not None]
     usual = near_row_depth(row) if row else _USUAL_DEPTH
     for frame, sightings in enumerate(frames):
-        view = _PairView.of(sightings, calibration, usual, usual + gates.max_row_offset)
+        view = _PairView.of(sightings, calibration, usual)
         positions[frame] = driven[frame] + correction
-        pairs = _assign(tracks, view, positions[frame], gates)
+        pairs = _assign(tracks, view, positions[frame])
         moves = [tracks[track].locate()[0] - view.along[new] - positions[frame] for track, new in pairs if view.is_in_row[new]]
         if len(moves) >= 3:
             correction += float(np.median(moves))
             positions[frame] = driven[frame] + correction
-            pairs = _assign(tracks, view, positions[frame], gates)
+            pairs = _assign(tracks, view, positions[frame])
         taken = {new: track for track, new in pairs}
         for new in map(int, np.flatnonzero(view.is_candidate)):
             depth = float(view.depth[new]) if view.is_measured[new] else math.nan
@@ -175,7 +156,7 @@ def track_stalks(
     length = abs(float(positions[-1] - positions[0]) + step) if len(positions) else 0.0
     in_view = [ray * usual - 0.5 * calibration.baseline for ray in field]
     path = RobotPath(positions, length, _seen_fraction(positions, step, in_view), usual)
-    closed = [_finish_track(track, path, step, field, gates) for track in _merge_tracks(tracks, gates)]
+    closed = [_finish_track(track, path, step, field) for track in _merge_tracks(tracks)]
     return sorted(closed, key=lambda track: track.position_m * (-1.0 if step < 0 else 1.0)), path
 
 
@@ -221,14 +202,14 @@ class _PairView:
     usual: float
 
     @classmethod
-    def of(cls, sightings: list[Sighting], calibration: Calibration, usual: float, farthest: float) -> "_PairView":
-        """Compute the view of a pair from its sightings, the usual depth of the row, and the greatest of its stalks, m."""
+    def of(cls, sightings: list[Sighting], calibration: Calibration, usual: float) -> "_PairView":
+        """Compute the view of a pair from its sightings and the usual depth of the row, m."""
         half = 0.5 * calibration.baseline
         rays = np.array([(sighting.column - calibration.centre[0]) / calibration.focal for sighting in sightings])
         along = np.array([math.nan if sighting.along_m is None else sighting.along_m for sighting in sightings])
         depth = np.array([math.nan if sighting.depth_m is None else sighting.depth_m for sighting in sightings])
         # Stalks behind the row are tracked, too, so that those of their sightings that have no depth are known to be theirs.
-        behind = depth > farthest
+        behind = depth > usual + _MAX_ROW_OFFSET
         along = np.where(behind & np.isnan(along), rays * depth - half, along)
         known = np.isfinite(along) & np.isfinite(depth)
         elsewhere = np.isfinite(depth) & ~known  # before the row
@@ -270,21 +251,21 @@ def _are_distinct(sightings: list[Sighting]) -> np.ndarray:
     return own
 
 
-def _assign(tracks: list[_OpenTrack], view: _PairView, position: float, gates: Gates) -> list[tuple[int, int]]:
+def _assign(tracks: list[_OpenTrack], view: _PairView, position: float) -> list[tuple[int, int]]:
     """Assign sightings to tracks by minimum cost; return pairs (track, sighting) of indices, each used at most once."""
     if not tracks or not view.rays.size:
         return []
     there = np.array([track.locate() for track in tracks])
     # A sighting without depth is compared at the depth of the track.
     along = np.where(view.is_measured, view.along, [view.along_at(depth) for _, depth in there]) + position
-    aside = np.abs(there[:, :1] - along) / gates.along
-    away = np.nan_to_num(np.abs(there[:, 1:] - view.depth[None]) / gates.depth, nan=0.4)
+    aside = np.abs(there[:, :1] - along) / _ALONG
+    away = np.nan_to_num(np.abs(there[:, 1:] - view.depth[None]) / _DEPTH, nan=0.4)
     cost = np.where((aside < 1.0) & (away < 1.0) & view.is_candidate, aside + 0.5 * away, _FORBIDDEN_COST)
     rows, columns = linear_sum_assignment(cost)
     return [(int(row), int(column)) for row, column in zip(rows, columns) if cost[row, column] < _FORBIDDEN_COST]
 
 
-def _merge_tracks(tracks: list[_OpenTrack], gates: Gates) -> list[_OpenTrack]:
+def _merge_tracks(tracks: list[_OpenTrack]) -> list[_OpenTrack]:
     """Merge tracks of one stalk into the longer one, which is modified in place: same position, and hardly ever seen together.
 
     Tracks are also merged if they always lie on the same rays and one of the depths is wrong: of two stalks one behind the
@@ -296,9 +277,9 @@ def _merge_tracks(tracks: list[_OpenTrack], gates: Gates) -> list[_OpenTrack]:
             aside, away = _track_distance(track, other)
             shared = {frame for frame, _ in track.sightings} & {frame for frame, _ in other.sightings}
             # A wrongly assigned sighting may make both appear in one pair.
-            near = aside < gates.merge and away < gates.depth
-            one_stalk = near or _one_behind(track, other) < gates.merge_across_depths
-            if one_stalk and len(shared) <= gates.max_shared * len(track.sightings):
+            near = aside < _MERGE and away < _DEPTH
+            one_stalk = near or _one_behind(track, other) < _MERGE_ACROSS_DEPTHS
+            if one_stalk and len(shared) <= _MAX_SHARED * len(track.sightings):
                 other.sightings += track.sightings
                 other.along += track.along
                 other.depth += track.depth
@@ -334,7 +315,7 @@ def _track_distance(track: _OpenTrack, other: _OpenTrack) -> tuple[float, float]
     return abs(track.position_at(depth) - other.position_at(depth)), 0.0
 
 
-def _finish_track(track: _OpenTrack, path: RobotPath, step: float, field: tuple[float, ...], gates: Gates) -> Track:
+def _finish_track(track: _OpenTrack, path: RobotPath, step: float, field: tuple[float, ...]) -> Track:
     position, usual = float(np.median(track.along)), path.row_depth
     depths = track.depths()
     depth = float(np.median(depths)) if depths.size else math.nan
@@ -343,13 +324,13 @@ def _finish_track(track: _OpenTrack, path: RobotPath, step: float, field: tuple[
     expected = int((np.abs(path.positions + middle - position) < 0.9 * half).sum())
     known = math.isfinite(depth)
     # A stalk without a measured depth must be seen twice as often.
-    wanted = max(min(gates.min_pairs, expected), math.ceil((1.0 if known else 2.0) * gates.min_fraction * expected), 1)
+    wanted = max(min(_MIN_PAIRS, expected), math.ceil((1.0 if known else 2.0) * _MIN_FRACTION * expected), 1)
     begin, end = sorted((path.positions[0] - 0.5 * step, path.positions[-1] + 0.5 * step))
     if len(track.sightings) < wanted:
         reason = f"seen in {len(track.sightings)} of {expected} pairs"
-    elif known and abs(depth - usual) > gates.max_row_offset:
+    elif known and abs(depth - usual) > _MAX_ROW_OFFSET:
         reason = f"it stands {abs(depth - usual):.2f} m {'behind' if depth > usual else 'before'} the row"
-    elif not begin - gates.end_margin <= float(np.median(track.feet)) <= end + gates.end_margin:
+    elif not begin - _END_MARGIN <= float(np.median(track.feet)) <= end + _END_MARGIN:
         reason = "it stands beyond the ends of the path"
     else:
         reason = ""
