@@ -174,6 +174,9 @@ def image_statistics(path: Path, finder: Finder, name: str, is_known: bool) -> l
         name: Name of the detector, whose last word identifies the cache.
         is_known: False to detect as if the camera were unknown.
     """
+    with np.load(path) as data:
+        if "behind_0" not in data:
+            raise SystemExit(f"{path} was rendered by an earlier version: choose a new folder")
     cached = path.with_suffix(f".{name.split()[-1]}.npz")
     if not cached.exists():
         arrays = {}

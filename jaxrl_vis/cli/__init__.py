@@ -53,8 +53,8 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {  # without those of `
 }
 
 _OUT_OF_MEMORY = (
-    "memory of the device or machine ran out. End other programs that use it (nvidia-smi lists those on a GPU), or use less: "
-    "fewer --seeds, --num-envs, --replay-transitions or --workers, a smaller --batch-size. Saved files are good"
+    "memory of the device or machine ran out ({}). End other programs that use it (nvidia-smi lists those on a GPU), or use "
+    "less: fewer --seeds, --num-envs, --replay-transitions or --workers, a smaller --batch-size. Saved files are good"
 )
 # Exit statuses of errors reported in one line.
 _STATUS: dict[type[Exception], int] = {RequestError: 2, StorageError: 1, WorkerError: 1, NonFiniteError: 4}
@@ -126,7 +126,8 @@ def _run_with_status(argv: Sequence[str], ending: Ending) -> int:
             print(f"{PROGRAM}: {str(error.filename)[:80]}... cannot be used ({error.strerror})", file=sys.stderr)
             return _STATUS[RequestError]
         if is_out_of_memory(error) and not distributed.is_multi_process():
-            print(f"{PROGRAM}: {_OUT_OF_MEMORY}", file=sys.stderr)
+            words = (str(error) or "MemoryError").splitlines()[0][:100]
+            print(f"{PROGRAM}: {_OUT_OF_MEMORY.format(words)}", file=sys.stderr)
             return 1
         if not distributed.is_multi_process():
             raise

@@ -197,17 +197,14 @@ def imtl_g(**options: Unpack[Options]) -> Weighting:
     """
 
     def weights(gramian: jax.Array) -> jax.Array:
-        highest = jax.lax.Precision.HIGHEST
-        eps = jnp.finfo(gramian.dtype).eps
         # Independent gradients are inverted at unit norm, so that short ones are not taken for dependent ones.
         unit, lengths = solvers.unit_gramian(gramian)
-        values = jnp.linalg.eigvalsh(unit)
-        independent = jnp.sum(solvers.pseudo_inverse(unit), axis=1) / lengths
+        of_unit, is_independent = solvers.pseudo_inverse(unit, rounding=16.0)
         norms = jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
-        dependent = jnp.dot(solvers.pseudo_inverse(gramian), norms, precision=highest)
-        raw = jnp.where(values[0] > 16.0 * len(gramian) * eps * values[-1], independent, dependent)
+        of_dependent = jnp.dot(solvers.pseudo_inverse(gramian)[0], norms, precision=jax.lax.Precision.HIGHEST)
+        raw = jnp.where(is_independent, jnp.sum(of_unit, axis=1) / lengths, of_dependent)
         total = jnp.sum(raw)
-        is_some = jnp.abs(total) > 10.0 * eps * jnp.sum(jnp.abs(raw))
+        is_some = jnp.abs(total) > 10.0 * jnp.finfo(gramian.dtype).eps * jnp.sum(jnp.abs(raw))
         return jnp.where(is_some, raw / jnp.where(is_some, total, 1.0), 0.0)
 
     return of_gramian("imtl_g", _plain(weights), **options)
@@ -302,7 +299,7 @@ def config(**options: Unpack[Options]) -> Weighting:
         lengths = jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
         inverse = jnp.where(lengths > 0.0, 1.0 / jnp.where(lengths > 0.0, lengths, 1.0), 0.0)
         unit = gramian * inverse[:, None] * inverse[None, :]
-        of_unit = jnp.sum(solvers.pseudo_inverse(unit, rounding=16.0), axis=1)
+        of_unit = jnp.sum(solvers.pseudo_inverse(unit, rounding=16.0)[0], axis=1)
         raw = inverse * of_unit
         squared = solvers.quadratic(gramian, raw)
         # The norm of U^+ 1 is at least 1 / sqrt(K), unless no direction has equal cosines: then the step is 0.

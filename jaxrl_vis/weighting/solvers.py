@@ -282,9 +282,17 @@ def quadratic(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     return jnp.dot(vector, jnp.dot(matrix, vector, precision=precision), precision=precision)
 
 
-def pseudo_inverse(gramian: jax.Array, rounding: float = 1.0) -> jax.Array:
-    """Compute the pseudo-inverse of a Gramian [K, K]; eigenvalues up to ``rounding`` K eps times the largest count as 0."""
+def pseudo_inverse(gramian: jax.Array, rounding: float = 1.0) -> tuple[jax.Array, jax.Array]:
+    """Compute the pseudo-inverse of a Gramian; eigenvalues up to ``rounding`` K eps times the largest count as 0.
+
+    Args:
+        gramian: [K, K] float.
+        rounding: See above.
+
+    Returns:
+        [K, K] pseudo-inverse; [] bool, True if no eigenvalue counts as 0.
+    """
     values, vectors = jnp.linalg.eigh(gramian)
     cut = rounding * len(gramian) * jnp.finfo(gramian.dtype).eps * jnp.max(jnp.abs(values))
     inverse = jnp.where(values > cut, 1.0 / jnp.where(values > cut, values, 1.0), 0.0)
-    return jnp.matmul(vectors * inverse, vectors.T, precision=jax.lax.Precision.HIGHEST)
+    return jnp.matmul(vectors * inverse, vectors.T, precision=jax.lax.Precision.HIGHEST), jnp.all(values > cut)
