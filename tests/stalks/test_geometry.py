@@ -297,6 +297,17 @@ def test_a_row_that_stands_nowhere_is_reported(baseline, distance):
     assert told is not None and told.startswith(f"its stalks stand {distance} m away") and "about 0.1 m would" in told
 
 
+def test_a_pair_that_shows_mostly_the_row_behind_is_used():
+    """Regression test: two in ten pairs of a plot by day were skipped, with a hint at the unit of a correct baseline."""
+    left, right, finds = stalks_at(68, *[34] * 5)
+    sightings = measure_pair(finds, left, right, CAMERA)
+    assert [sighting.diameter_mm is not None for sighting in sightings] == [True] + [False] * 5
+    assert pair_fault(finds, sightings, left, right, CAMERA) is None
+    wrong = dataclasses.replace(CAMERA, baseline=1.0)
+    told = pair_fault(finds, measure_pair(finds, left, right, wrong), left, right, wrong)
+    assert told is not None and told.startswith("its stalks stand 16 m away")
+
+
 def test_stalks_of_the_row_behind_are_placed_there():
     """Something similar is nearer: within the depths of a row alone, the stalks would be matched with it."""
     left, right, finds = stalks_at(68, 34, 34, 34)

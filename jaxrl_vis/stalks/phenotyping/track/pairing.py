@@ -90,6 +90,9 @@ def _distance_fault(detections: list[Detection], left: np.ndarray, right: np.nda
     agree = np.mean(np.abs(np.array(depths) / depth - 1.0) < _SAME_DEPTH)
     if DEPTHS[0] <= depth <= DEPTHS[1] or agree < _LARGE_FRACTION:
         return None
+    # By day, most of the stalks may be those of a row behind; in a wrong unit, those of the row would be as far off.
+    if depth > DEPTHS[1] and any(DEPTHS[0] <= other <= DEPTHS[1] for other in depths):
+        return None
     baseline = calibration.baseline * USUAL_DISTANCE / depth
     return (
         f"its stalks stand {depth:.2g} m away by the calibration, not {DEPTHS[0]} to {DEPTHS[1]} m: say in which unit its "
