@@ -326,10 +326,10 @@ def _finish_track(track: _OpenTrack, path: RobotPath, step: float, field: tuple[
     # A stalk without a measured depth must be seen twice as often.
     wanted = max(min(_MIN_PAIRS, expected), math.ceil((1.0 if known else 2.0) * _MIN_FRACTION * expected), 1)
     begin, end = sorted((path.positions[0] - 0.5 * step, path.positions[-1] + 0.5 * step))
-    if len(track.sightings) < wanted:
-        reason = f"seen in {len(track.sightings)} of {expected} pairs"
-    elif known and abs(depth - usual) > _MAX_ROW_OFFSET:
+    if known and abs(depth - usual) > _MAX_ROW_OFFSET:
         reason = f"it stands {abs(depth - usual):.2f} m {'behind' if depth > usual else 'before'} the row"
+    elif len(track.sightings) < wanted:
+        reason = f"seen in {len(track.sightings)} of {expected} pairs"
     elif not begin - _END_MARGIN <= float(np.median(track.feet)) <= end + _END_MARGIN:
         reason = "it stands beyond the ends of the path"
     else:
