@@ -10,7 +10,8 @@
     contrastive_view  table of the task of contrastive RL
     thesis       claims of the thesis compared with the records, for docs/claims.md and, abridged, the README
     prose        comparison of sentences that quote numbers with their pages
-    sentences    these sentences, with computed numbers; ol_aux_sentences has those of the study of auxiliary losses
+    sentences    these sentences, with computed numbers; ol_aux_sentences has those of the study of auxiliary losses,
+                 comparison_sentences those of figures goals and weightings
     pages        all tables, by page and marker
     markdown     rows of records as a table in Markdown
 

@@ -10,6 +10,7 @@ _METHODS = {
     "indicator_balance_filter": "`indicator_balance_filter`",
     "oracle": "`oracle`",
     "contrastive": "`contrastive`, `stable`",
+    "contrastive_nce": "`contrastive`, `nce`",
     "contrastive_1M": "`contrastive`, `stable`",
     "contrastive_nce_1M": "`contrastive`, `nce`",
 }

@@ -6,14 +6,14 @@ from benchmarks.claims.records import Record, variants
 from jaxrl_vis.studies.goals import FAMILY, STUDIES
 
 GUIDE = "docs/algorithms.md"
-_BUDGETS = {**STUDIES["goals"].steps, **STUDIES["goals"].optional_steps}
+BUDGETS = {**STUDIES["goals"].steps, **STUDIES["goals"].optional_steps}
 _BASELINE = "oracle"
 _LEVEL = 0.9
 
 
 def task_table(task: str, records: dict[str, Record]) -> str:
     """Return the table of a task, in the order of its records."""
-    budget, base = _BUDGETS[task], records[_BASELINE]
+    budget, base = BUDGETS[task], records[_BASELINE]
     columns = [
         c.seeds(),
         c.steps_to(_LEVEL),
@@ -27,6 +27,6 @@ def task_table(task: str, records: dict[str, Record]) -> str:
 
 def tables() -> dict[str, dict[str, str]]:
     """Return the tables, page -> marker -> text; none without records."""
-    by_task = {task: variants(FAMILY, task) for task in _BUDGETS}
+    by_task = {task: variants(FAMILY, task) for task in BUDGETS}
     texts = {task: task_table(task, records) for task, records in by_task.items() if _BASELINE in records}
     return {GUIDE: texts} if texts else {}

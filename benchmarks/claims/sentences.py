@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from benchmarks.claims import columns as c
-from benchmarks.claims import indicator, ol_aux, ol_aux_sentences, thesis
+from benchmarks.claims import comparison_sentences, indicator, ol_aux, ol_aux_sentences, thesis
 from benchmarks.claims.ablations import FAST, OPTIONS
 from benchmarks.claims.indicator import LAB as RULES
 from benchmarks.claims.indicator import OURS, REACHER, SAWYER
@@ -221,4 +221,8 @@ def sentences() -> list[Sentence]:
         _devices,
         _decays,
     )
-    return [*ol_aux_sentences.sentences(), *(sentence for part in parts for sentence in part())]
+    return [
+        *ol_aux_sentences.sentences(),
+        *comparison_sentences.sentences(),
+        *(sentence for part in parts for sentence in part()),
+    ]

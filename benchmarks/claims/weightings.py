@@ -6,13 +6,13 @@ from benchmarks.claims.records import Record, variants
 from jaxrl_vis.studies.weightings import FAMILY, STUDIES
 
 GUIDE = "docs/weighting.md"
-_BUDGETS = STUDIES["weightings"].steps
+BUDGETS = STUDIES["weightings"].steps
 _BASELINE = "sum"
 
 
 def task_table(task: str, records: dict[str, Record]) -> str:
     """Return the table of a task, by descending mean success."""
-    budget, base = _BUDGETS[task], records[_BASELINE]
+    budget, base = BUDGETS[task], records[_BASELINE]
     order = sorted(records, key=lambda variant: -records[variant].means(budget).mean())
     columns = [
         c.seeds(),
@@ -26,6 +26,6 @@ def task_table(task: str, records: dict[str, Record]) -> str:
 
 def tables() -> dict[str, dict[str, str]]:
     """Return the tables, page -> marker -> text; none without records."""
-    by_task = {task: variants(FAMILY, task) for task in _BUDGETS}
+    by_task = {task: variants(FAMILY, task) for task in BUDGETS}
     texts = {task: task_table(task, records) for task, records in by_task.items() if _BASELINE in records}
     return {GUIDE: texts} if texts else {}
