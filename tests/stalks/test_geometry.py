@@ -336,6 +336,20 @@ def test_disparities_that_agree_behind_the_row_beat_better_correlations_that_do_
     assert depths[3:] == pytest.approx([54.2 / 34] * 3, abs=0.04)
 
 
+def test_a_stalk_of_the_row_that_is_mostly_occluded_is_not_placed_behind_it():
+    """In the right image a leaf covers most of it, and something similar is where a stalk behind would be."""
+    left, right, finds = stalks_at(68)
+    random = np.random.default_rng(0)
+    for column in COLUMNS[-3:]:
+        stalk = right[:, column - 68 : column - 54]
+        stalk[:150] = stalk[220:] = random.integers(0, 255, 3)
+        noise = random.integers(-40, 40, (400, 14, 3))
+        right[:, column - 34 : column - 20] = np.clip(left[:, column : column + 14].astype(int) + noise, 0, 255)
+    depths = [sighting.depth_m for sighting in measure_pair(finds, left, right, CAMERA)]
+    assert depths[:3] == pytest.approx([54.2 / 68] * 3, abs=0.02)
+    assert depths[3:] == [None] * 3 or depths[3:] == pytest.approx([54.2 / 68] * 3, abs=0.02)
+
+
 def test_what_the_right_image_does_not_reach_has_no_depth():
     """The right image ends before the leftmost stalk; a match with a similar texture would put it 1.2 m away."""
     left, right, finds = stalks_at(68)

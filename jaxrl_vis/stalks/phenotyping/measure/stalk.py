@@ -175,7 +175,8 @@ def _disparity(
 ) -> StalkDisparity:
     """Compute the disparities of a stalk within a range of depths, m, or behind it.
 
-    Those behind must agree on an upright stalk, and correlate clearly more if those within the range agree, too. See
+    Those behind must agree on an upright stalk, and correlate clearly more if those within the range agree, too. A stalk of the
+    row that others partly occlude matches in a few windows only, and by chance in many behind the row, but less well. See
     `stalk_disparity`.
     """
     behind, far, near = (float(calibration.disparity(np.array(depth))) for depth in (_BEHIND, *depths[::-1]))
@@ -185,7 +186,8 @@ def _disparity(
     if wanted >= in_row.window_count:  # no correlation exceeds 1
         return in_row
     matched = stalk_disparity(strip, corner, left, right, calibration, (behind, far), disparity)
-    there = matched.at(row) if matched.scores.sum() > wanted else None
+    is_partly_occluded = in_row.usual_score() > matched.usual_score() and in_row.is_consistent()
+    there = matched.at(row) if matched.scores.sum() > wanted and not is_partly_occluded else None
     return in_row if there is None or abs(_tilt(matched, there[0], calibration)) > _MAX_TILT else matched
 
 

@@ -43,6 +43,17 @@ class StalkDisparity:
     scores: np.ndarray
     window_count: int
 
+    def usual_score(self) -> float:
+        """Return the median correlation of the matched windows; 0 if there are none."""
+        return median(self.scores) if self.scores.size else 0.0
+
+    def is_consistent(self) -> bool:
+        """Return True unless most of the matched windows, and more than two, disagree with the median disparity."""
+        if not self.values.size:
+            return True
+        outliers = np.count_nonzero(np.abs(self.values - median(self.values)) > _SCATTER)
+        return outliers <= max(2, self.values.size / 2)
+
     def at(self, row: float) -> tuple[float, float] | None:
         """Estimate the disparity in an image row by a robust straight-line fit to the windows.
 
