@@ -56,7 +56,11 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/lab/renderer_speed.md": {"warp": render.warp_table, "mujoco": render.mujoco_table},
     "docs/reliability.md": {"soak": soak},
     "docs/lab/renderer_parity.md": {"table": renderer_parity},
-    "docs/phenotyping.md": {"lenses": stalks.lens_table, "coverage": stalks.coverage_table},
+    "docs/phenotyping.md": {
+        "lenses": stalks.lens_table,
+        "coverage": stalks.coverage_table,
+        "families": stalks.families_table,
+    },
     "docs/export.md": {"policies": exported.exported_table},
     "docs/algorithms.md": {"forms": contrastive.forms_table},
     "docs/indicator_rewards.md": {"host": host.host_table, "audit": audit.audit_table},

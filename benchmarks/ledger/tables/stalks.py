@@ -1,15 +1,24 @@
-"""Tables of docs/phenotyping.md: lenses (`benchmarks.stalks.lenses`), and intervals of widths (`phenotype eval --json`)."""
+"""Tables of docs/phenotyping.md: lenses (`benchmarks.stalks.lenses`), and widths and families (`phenotype eval --json`)."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.claims.markdown import origin_sentence
+from benchmarks.claims.records import Record
 from benchmarks.ledger.records import RESULTS
 from jaxrl_vis.stalks.phenotyping.measure.lens import VALIDATED
 from jaxrl_vis_envs.documents import read_json
 
 LENSES = Path("phenotyping") / "lenses.json"
+FAMILIES = {
+    "training": "`training`: at night, as in training, unseen seeds",
+    "shifted": "`shifted`: at night, all shifted",
+    "thin_wet": "`thin_wet`: thin, crowded, wet sorghum at night",
+    "maize_by_day": "`maize_by_day`: green maize, rows behind",
+}
+"""Description by name of the family, and of its record in ``phenotyping/families``."""
 
 
 def lens_table(results: Path = RESULTS) -> str | None:
@@ -69,3 +78,36 @@ def coverage_table(results: Path = RESULTS) -> str | None:
         )
         lines.append(f"| {family} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+def families_table(results: Path = RESULTS) -> str | None:
+    """Return a table of the records of `phenotype eval` for several families; None without records."""
+    lines = [
+        "| family | plots | stalks per plot | error | bias | R² | widths | mean absolute error, mm | bias, mm "
+        "| coverage of 95 % | precision | recall | F1 |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    origins = set()
+    for family, title in FAMILIES.items():
+        path = results / "phenotyping" / "families" / f"{family}.json"
+        if not path.exists():
+            continue
+        record = read_json(path)
+        plots = record["each"]
+        origins |= {f"{(plot['revision'] or 'unknown')[:7]} on {plot['device'].removesuffix(' x1')}" for plot in plots}
+        cells = (
+            f"{record['plots']}",
+            f"{record['count_true'] / record['plots']:.1f}",
+            f"{record['count_mae']:.2f}",
+            f"{100 * record['count_bias']:+.1f} %",
+            f"{record['count_r2']:.3f}",
+            f"{record['widths']}",
+            f"{record['width_mae_mm']:.2f}",
+            f"{record['width_bias_mm']:+.2f}",
+            f"{100 * record['width_coverage_95']:.0f} %",
+            *(f"{record[name]:.3f}" for name in ("precision", "recall", "f1")),
+        )
+        lines.append(f"| {title} | " + " | ".join(cells) + " |")
+    if not origins:
+        return None
+    return "\n".join([*lines, "", origin_sentence([Record("families", (), frozenset(origins))])])
