@@ -18,10 +18,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.stalks.gate_fit import fit_gate, fit_logistic_regression, write_gate
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.host.worker_pool import evaluate_all, share_accelerator
 from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Finder, in_frame
-from jaxrl_vis.stalks.phenotyping.detector.gate import Gate, fit_gate, fit_logistic_regression, gate_path, write_gate
+from jaxrl_vis.stalks.phenotyping.detector.gate import Gate, gate_path
 from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder
 from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.weights import PHOTOGRAPHS, SHIPPED

@@ -9,10 +9,16 @@ import argparse
 import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.measure.stalk import measure_stalk
-from jaxrl_vis.stalks.phenotyping.measure.stereo import to_grey_floats
 from jaxrl_vis_envs.plants import FAMILIES, Family, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import outline, stalks_in_view
+
+
+def to_grey_floats(image: np.ndarray) -> np.ndarray:
+    """Convert an image [H, W] or [H, W, 3] of any dtype to greyscale [H, W] float32."""
+    return (
+        image.astype(np.float32) if image.ndim == 2 else image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
+    )
 
 
 def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]]:

@@ -85,6 +85,15 @@ def stalk_reach(env: Any) -> tuple[Policy, Any]:
     return act, None
 
 
+def point_mass(env: Any) -> tuple[Policy, Any]:
+    """Return a proportional-derivative controller of the ball."""
+
+    def act(state: Any, goal: Any, memory: Any) -> tuple[jax.Array, Any]:
+        return 10.0 * (state.goal_state - state.data.qpos) - 2.0 * state.data.qvel, memory
+
+    return act, None
+
+
 def reacher(env: Any) -> tuple[Policy, Any]:
     """Return a velocity controller that moves each joint to its angle at the goal, with the elbow bent to the left."""
     upper, fore = 0.1, 0.11  # m
@@ -119,6 +128,7 @@ POLICIES: dict[str, Callable[[Any], tuple[Policy, Any]]] = {
     "FetchPush": fetch_push,
     "FetchReach": fetch_reach,
     "HandReach": hand_reach,
+    "PointMass": point_mass,
     "Reacher": reacher,
     "SawyerReach": sawyer_reach,
     "StalkReach": stalk_reach,

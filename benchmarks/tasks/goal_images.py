@@ -30,6 +30,7 @@ PARTS: dict[str, dict[str, tuple[str, ...]]] = {
     "VisualFetchReach": {"gripper": ("palm", "left_finger", "right_finger"), "fingers": ("left_finger", "right_finger")},
     "VisualFingerTurn": {"spinner tip": ("tip_marker",), "fingertip": ("fingertip",)},
     "VisualHandReach": {f"{tip} tip": (f"{tip}tip",) for tip in ("ff", "mf", "rf", "lf", "th")},
+    "VisualPointMass": {"ball": ("ball",)},
     "VisualReacher": {"fingertip": ("fingertip",)},
     "VisualSawyerReach": {"gripper": ("palm", "left_finger", "right_finger"), "fingers": ("left_finger", "right_finger")},
     "VisualStalkReach": {"gripper": ("palm", "left_jaw", "right_jaw"), "stalks": tuple(f"upper_{index}" for index in range(4))},

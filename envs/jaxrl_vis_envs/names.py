@@ -8,6 +8,7 @@ TASKS = {
     "FetchReach": "jaxrl_vis_envs.tasks.fetch_reach",
     "FingerTurn": "jaxrl_vis_envs.tasks.finger_turn",
     "HandReach": "jaxrl_vis_envs.tasks.hand_reach",
+    "PointMass": "jaxrl_vis_envs.tasks.point_mass",
     "Reacher": "jaxrl_vis_envs.tasks.reacher",
     "SawyerReach": "jaxrl_vis_envs.tasks.sawyer_reach",
     "StalkReach": "jaxrl_vis_envs.tasks.stalk_reach",

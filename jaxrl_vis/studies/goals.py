@@ -11,6 +11,7 @@ from jaxrl_vis.studies import indicator
 from jaxrl_vis.studies.engine.study import Family, Study, Variant
 from jaxrl_vis.studies.indicator import FETCH, FINGER, HAND, REACHER, SAWYER
 
+POINT = "VisualPointMass"
 _TD3: dict[str, Any] = changes(algorithm="td3", actor_interval=2, target_update_interval=2)
 _CONTRASTIVE: dict[str, Any] = changes(
     algorithm="contrastive", future_goals="geometric", relabel_probability=1.0, balance_probability=0.0, trivial_goals=1.0
@@ -32,7 +33,7 @@ VARIANTS: dict[str, Variant] = {
 FAMILY = Family(
     name="goals",
     variants=VARIANTS,
-    tasks=(FETCH, REACHER, SAWYER, HAND, FINGER, "FetchReach", "Reacher"),
+    tasks=(FETCH, REACHER, SAWYER, HAND, FINGER, POINT, "FetchReach", "Reacher", "PointMass"),
     preset="fast",
     of_task=indicator.FAMILY.of_task,
     max_steps={},
@@ -44,7 +45,7 @@ STUDIES: dict[str, Study] = {
         FAMILY,
         "Learning from goal images",
         ("oracle", "autoencoder", "indicator", _OURS, "classifier", "contrastive", "td3_oracle"),
-        {FETCH: 50_000, REACHER: 100_000, SAWYER: 100_000, HAND: 500_000, FINGER: 300_000},
-        optional_steps={"FetchReach": 50_000, "Reacher": 100_000},
+        {FETCH: 50_000, REACHER: 100_000, SAWYER: 100_000, HAND: 500_000, FINGER: 300_000, POINT: 100_000},
+        optional_steps={"FetchReach": 50_000, "Reacher": 100_000, "PointMass": 100_000},
     )
 }

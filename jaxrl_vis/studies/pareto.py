@@ -78,12 +78,6 @@ def descend(weighting: Weighting) -> Paths:
     return Paths(*map(np.asarray, jax.jit(jax.vmap(path))(jnp.array(STARTS))))
 
 
-def distance_to_front(points: np.ndarray) -> np.ndarray:
-    """Compute the distance of points [..., 2] from the Pareto front: [...]."""
-    beyond = np.maximum(np.abs(points[..., 0]) - 1.0, 0.0)
-    return np.hypot(beyond, points[..., 1])
-
-
 def draw(path: Path) -> None:
     """Write a figure of the paths of the weightings in `DRAWN`.
 

@@ -32,7 +32,7 @@ FAMILY = Family(
     variants=VARIANTS,
     tasks=(FETCH, HAND, FINGER),
     preset="fast",
-    of_task={},
+    of_task={("fast", HAND): {"replay_transitions": 300_000}},  # as many as there are steps
     max_steps={},
     quick_changes={},
 )

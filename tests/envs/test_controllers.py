@@ -9,6 +9,7 @@ EPISODES = {
     "FetchReach": 24,
     "FingerTurn": 6,
     "HandReach": 16,
+    "PointMass": 64,
     "Reacher": 64,
     "SawyerReach": 64,
     "StalkReach": 64,

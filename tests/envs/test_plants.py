@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.stalks.perfect_masks import to_grey_floats
 from jaxrl_vis import cli
 from jaxrl_vis.stalks.phenotyping.measure.stalk import measure_stalk
-from jaxrl_vis.stalks.phenotyping.measure.stereo import to_grey_floats
 from jaxrl_vis_envs import plants
 from jaxrl_vis_envs.plants import SHIFTED, SHIFTS, TRAINING
 from jaxrl_vis_envs.plants.family import INCH, Family, Layout, Rig, Stalks

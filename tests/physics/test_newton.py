@@ -149,6 +149,7 @@ ON_A_CPU = {
     "FetchReach": "newton",
     "FingerTurn": "scalar",
     "HandReach": "mjx",
+    "PointMass": "newton",
     "Reacher": "newton",
     "SawyerReach": "newton",
     "StalkReach": "newton",

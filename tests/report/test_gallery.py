@@ -18,9 +18,9 @@ from jaxrl_vis_envs import registry
 @pytest.fixture
 def own_environment() -> Iterator[str]:
     """Name of a user's environment, registered for the duration of a test."""
-    registry.register("VisualPointMass", PointMass, PointMassConfig)
-    yield "VisualPointMass"
-    del registry._ENTRIES["VisualPointMass"]
+    registry.register("VisualOwnMass", PointMass, PointMassConfig)
+    yield "VisualOwnMass"
+    del registry._ENTRIES["VisualOwnMass"]
 
 
 def rows(output: str) -> dict[str, list[str]]:

@@ -4,6 +4,7 @@ import json
 import shutil
 import struct
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -87,9 +88,17 @@ def assert_shown(path: Path, seed: int, name: str) -> None:
     assert [value for _, value in curve] == pytest.approx([value for _, value in there])
 
 
+def complete_wandb_runs(path: Path) -> dict[int, list[dict[str, Any]]]:
+    """Return the histories once W&B's own process, for which `finish` does not wait, has written all rows of metrics.jsonl."""
+    count, deadline = len(metrics.read_rows(path / "metrics.jsonl")), time.monotonic() + 10.0
+    while sum(map(len, wandb_runs(path).values())) < count and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return wandb_runs(path)
+
+
 def check_all(path: Path) -> None:
     """Check that both loggers show each evaluation of both seeds once, as metrics.jsonl does."""
-    runs = wandb_runs(path)
+    runs = complete_wandb_runs(path)
     for seed in (0, 1):
         for name in ("eval/success", "train/critic_loss"):
             assert_shown(path, seed, name)
@@ -110,7 +119,7 @@ def test_both_show_what_the_run_has_written(tmp_path: Path, capsys: pytest.Captu
     assert images["video"].encoded_image_string == (path / "video.gif").read_bytes() and images["video"].width > 100
     (text,) = [value for event in first for value in event.summary.value if value.tag == "config/text_summary"]
     assert '"num_envs": 2' in text.tensor.string_val[0].decode()
-    last = wandb_runs(path)[0][-1]
+    last = complete_wandb_runs(path)[0][-1]
     assert (last["env_steps"], last["video/_type"], last["curve/_type"]) == (80, "video-file", "image-file")
     (file,) = path.glob(f"wandb/*run-*/run-{json.loads((path / 'wandb.json').read_text())['1']['id']}.wandb")
     run, *_ = [record.run for record in records(file) if record.WhichOneof("record_type") == "run"]

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxrl_vis.stalks.phenotyping.detector.gate import fit_gate, gate_path, read_gate, write_gate
+from benchmarks.stalks.gate_fit import fit_gate, write_gate
+from jaxrl_vis.stalks.phenotyping.detector.gate import gate_path, read_gate
 from jaxrl_vis.stalks.phenotyping.pipeline import _unfamiliar_note
 
 SURE, UNSURE = np.array([0.97, 0.95, 0.02]), np.array([0.6, 0.45, 0.3])

@@ -170,14 +170,6 @@ def check_supported(mj_model: mujoco.MjModel, groups: tuple[int, ...], leave_out
             raise ValueError(f"cannot render {names}: move it to a hidden group, or use leave_out=({kind!r},)")
 
 
-def object_name(mj_model: mujoco.MjModel, index: int) -> str:
-    """Return the name of object ``index`` (a geom, or ngeom + a site) for messages, which never concern tendons."""
-    is_geom = index < mj_model.ngeom
-    number = int(index if is_geom else index - mj_model.ngeom)
-    name = (mj_model.geom(number) if is_geom else mj_model.site(number)).name or f"number {number}"
-    return f"{'geom' if is_geom else 'site'} {name}"
-
-
 def object_materials(mj_model: mujoco.MjModel) -> np.ndarray:
     """Return the material [N] of every geom, then of every site and every tendon; -1 for none."""
     return np.concatenate([mj_model.geom_matid, mj_model.site_matid, mj_model.tendon_matid])

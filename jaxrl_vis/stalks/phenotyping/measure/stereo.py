@@ -52,7 +52,7 @@ class StalkDisparity:
         if not self.values.size:
             return True
         outliers = np.count_nonzero(np.abs(self.values - median(self.values)) > _SCATTER)
-        return outliers <= max(2, self.values.size / 2)
+        return bool(outliers <= max(2, self.values.size / 2))
 
     def at(self, row: float) -> tuple[float, float] | None:
         """Estimate the disparity in an image row by a robust straight-line fit to the windows.
@@ -82,13 +82,6 @@ class StalkDisparity:
         mean = float(remaining.sum()) / count
         scatter = max(math.sqrt(float(((remaining - mean) ** 2).sum()) / count), 0.02)
         return mean, scatter / math.sqrt(count)
-
-
-def to_grey_floats(image: np.ndarray) -> np.ndarray:
-    """Convert an image [H, W] or [H, W, 3] of any dtype to greyscale [H, W] float32."""
-    return (
-        image.astype(np.float32) if image.ndim == 2 else image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
-    )
 
 
 def match_rows(
