@@ -169,6 +169,11 @@ TASKS: Mapping[tuple[str, str], TaskValues] = {
         images={"critic_states": True},
         oracle={"trivial_goals": 0.2},
     ),
+    ("cpu", "PointMass"): TaskValues(
+        always={"encoders": "shared", "target_encoder": False},
+        images={"env_steps": 96_000, "random_shift": 1, "relabel_probability": 0.8},
+        images_and_oracle={"balance_probability": 0.3},
+    ),
     ("cpu", "Reacher"): TaskValues(images={"relabel_probability": 0.8}, images_and_oracle={"balance_probability": 0.3}),
     ("fast", "FingerTurn"): _FINGER,
     ("cpu", "FingerTurn"): _FINGER,
