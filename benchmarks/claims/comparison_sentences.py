@@ -100,7 +100,8 @@ def _weightings() -> Iterator[Sentence]:
     quote = "`imtl_g` is unstable: in each seed success falls by more than half at some time"
     yield Sentence(WEIGHTING, quote, fetch["imtl_g"].name, min(falls) > 0.5)
     against_none = verdicts(finger, "none", steps[FINGER])
-    quote = f"On FingerTurn five auxiliary losses help with every weighting** ({_p_of_all(finger, 'none', steps[FINGER])})"
+    count, p = len(finger) - 1, _p_of_all(finger, "none", steps[FINGER])
+    quote = f"On FingerTurn five auxiliary losses help with each of {count} weightings** ({p})"
     yield Sentence(WEIGHTING, quote, finger["sum"].name, set(against_none.values()) == {"better"})
     against_sum = verdicts({name: record for name, record in finger.items() if name != "none"}, "sum", steps[FINGER])
     first = [c.p_text(finger[name], finger["sum"], steps[FINGER]) for name in ("uncertainty", "imtl_l", "ol_aux_5")]
