@@ -83,9 +83,9 @@ def coverage_table(results: Path = RESULTS) -> str | None:
 def families_table(results: Path = RESULTS) -> str | None:
     """Return a table of the records of `phenotype eval` for several families; None without records."""
     lines = [
-        "| family | plots | stalks per plot | error | bias | R² | widths | mean absolute error, mm | bias, mm "
-        "| coverage of 95 % | precision | recall | F1 |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "| family | plots | stalks per plot | error of the count (bias, R²) | error of widths, mm (bias) | coverage of 95 % "
+        "| F1 (precision, recall) |",
+        "|---|---|---|---|---|---|---|",
     ]
     origins = set()
     for family, title in FAMILIES.items():
@@ -98,14 +98,10 @@ def families_table(results: Path = RESULTS) -> str | None:
         cells = (
             f"{record['plots']}",
             f"{record['count_true'] / record['plots']:.1f}",
-            f"{record['count_mae']:.2f}",
-            f"{100 * record['count_bias']:+.1f} %",
-            f"{record['count_r2']:.3f}",
-            f"{record['widths']}",
-            f"{record['width_mae_mm']:.2f}",
-            f"{record['width_bias_mm']:+.2f}",
+            f"{record['count_mae']:.2f} ({100 * record['count_bias']:+.1f} %, {record['count_r2']:.3f})",
+            f"{record['width_mae_mm']:.2f} ({record['width_bias_mm']:+.2f})",
             f"{100 * record['width_coverage_95']:.0f} %",
-            *(f"{record[name]:.3f}" for name in ("precision", "recall", "f1")),
+            f"{record['f1']:.3f} ({record['precision']:.3f}, {record['recall']:.3f})",
         )
         lines.append(f"| {title} | " + " | ".join(cells) + " |")
     if not origins:
