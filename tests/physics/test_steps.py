@@ -21,6 +21,7 @@ from nvidia import lowered_for_nvidia
 import jaxrl_vis_envs
 from benchmarks.tasks import environments
 from jaxrl_vis_envs.compiling.compilation import KERNELS_VARIABLE, kernels, tracing_for
+from jaxrl_vis_envs.names import TASKS
 from jaxrl_vis_envs.physics import mjx_model, scalar
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.physics.scalar import (
@@ -487,7 +488,7 @@ def test_the_probe_is_a_kernel_for_nvidia():
 
 
 def test_which_models_the_scalar_engine_supports():
-    for name in ("FingerTurn", "HandReach", "Reacher", "FetchReach", "FetchPush", "SawyerReach", "StalkReach"):
+    for name in TASKS:
         assert scalar.supports(environments.make(name)._model), name
     hand = environments.make("HandReach")
     assert scalar.supports(hand._goal_model)
