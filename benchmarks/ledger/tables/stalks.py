@@ -14,7 +14,7 @@ from jaxrl_vis_envs.documents import read_json
 LENSES = Path("phenotyping") / "lenses.json"
 FAMILIES = {
     "training": "`training`: at night, as in training, unseen seeds",
-    "shifted": "`shifted`: at night, all shifted",
+    "shifted": "`shifted`: at night, all factors shifted",
     "thin_wet": "`thin_wet`: thin, crowded, wet sorghum at night",
     "maize_by_day": "`maize_by_day`: green maize, rows behind",
 }

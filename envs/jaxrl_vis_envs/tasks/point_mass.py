@@ -1,7 +1,7 @@
 """PointMass: push a ball to its position in the goal image, the smallest task.
 
-The idea is that of dm_control's ``point_mass``. Friction is strong, so that a single image tells nearly everything about the
-ball: without a push it stops within two control steps.
+The idea is that of dm_control's ``point_mass``. Friction is strong, so that a single image shows nearly all of the ball's
+state: without a push it loses 86 % of its velocity within two control steps.
 
     VisualPointMass   observes RGB-D from above
     PointMass         observes position and velocity
