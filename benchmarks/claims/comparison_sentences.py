@@ -9,6 +9,7 @@ from benchmarks.claims import goals, weightings
 from benchmarks.claims.prose import Sentence
 from benchmarks.claims.records import Record, variants
 from jaxrl_vis.studies.goals import FAMILY as GOALS
+from jaxrl_vis.studies.goals import POINT
 from jaxrl_vis.studies.indicator import FETCH, FINGER, HAND, REACHER, SAWYER
 from jaxrl_vis.studies.weightings import FAMILY as WEIGHTINGS
 
@@ -17,7 +18,7 @@ _OURS, _STATES = "indicator_balance_filter", ("oracle", "td3_oracle")
 
 
 def _goals() -> Iterator[Sentence]:
-    tasks = {task: variants(GOALS, task) for task in (FETCH, REACHER, SAWYER, HAND, FINGER)}
+    tasks = {task: variants(GOALS, task) for task in (FETCH, REACHER, SAWYER, HAND, FINGER, POINT)}
     ours = {task: records[_OURS] for task, records in tasks.items()}
 
     def p(task: str, first: str, second: str) -> str:
@@ -47,6 +48,13 @@ def _goals() -> Iterator[Sentence]:
     is_behind = [verdict(task, "oracle", _OURS) for task in (FETCH, SAWYER, HAND)] == ["better"] * 3
     quote = f"is better ({p(FETCH, 'oracle', _OURS)}) on all of them but Reacher ({p(REACHER, 'oracle', _OURS)})"
     yield Sentence(ALGORITHMS, quote, name, is_behind and verdict(REACHER, "oracle", _OURS) == "level")
+    others = [rival for rival in tasks[POINT] if rival != "contrastive"]
+    first = {verdict(POINT, "contrastive", rival) for rival in others} == {"better"}
+    quote = f"better than all others, the oracle included** ({_p_of_all(tasks[POINT], 'contrastive', goals.BUDGETS[POINT])}): "
+    final = tasks[POINT]["contrastive"].median()
+    yield Sentence(ALGORITHMS, f"{quote}{final:.2f} at 100 k", tasks[POINT]["contrastive"].name, first)
+    quote = f"level with the oracle there ({p(POINT, _OURS, 'oracle')})"
+    yield Sentence(ALGORITHMS, quote, ours[POINT].name, verdict(POINT, _OURS, "oracle") == "level")
     similar = [max(tasks[task][rival].median() for rival in ("autoencoder", "features")) for task in (FETCH, SAWYER, HAND)]
     quote = "end at {:.2f} on FetchReach, {:.2f} on SawyerReach and {:.2f} on HandReach at most".format(*similar)
     yield Sentence(ALGORITHMS, quote, name)
@@ -60,26 +68,36 @@ def _goals() -> Iterator[Sentence]:
     levels = [verdict(task, "td3_oracle", "oracle") for task in (FETCH, HAND, FINGER)]
     quote = (
         f"With the oracle it is level with DDPG on FetchReach, HandReach and FingerTurn and worse on SawyerReach "
-        f"({p(SAWYER, 'td3_oracle', 'oracle')}) and Reacher ({p(REACHER, 'td3_oracle', 'oracle')})"
+        f"({p(SAWYER, 'td3_oracle', 'oracle')}), Reacher ({p(REACHER, 'td3_oracle', 'oracle')}) and PointMass "
+        f"({p(POINT, 'td3_oracle', 'oracle')})"
     )
-    worse = [verdict(task, "td3_oracle", "oracle") for task in (SAWYER, REACHER)]
-    yield Sentence(ALGORITHMS, quote, tasks[SAWYER]["td3_oracle"].name, levels == ["level"] * 3 and worse == ["worse"] * 2)
+    worse = [verdict(task, "td3_oracle", "oracle") for task in (SAWYER, REACHER, POINT)]
+    yield Sentence(ALGORITHMS, quote, tasks[SAWYER]["td3_oracle"].name, levels == ["level"] * 3 and worse == ["worse"] * 3)
     quote = f"better on HandReach ({p(HAND, 'td3_ours', _OURS)}) and level on FetchReach ({p(FETCH, 'td3_ours', _OURS)})"
     is_so = [verdict(task, "td3_ours", _OURS) for task in (HAND, FETCH)] == ["better", "level"]
     yield Sentence(ALGORITHMS, quote, tasks[HAND]["td3_ours"].name, is_so)
-    states = {task: variants(GOALS, task) for task in ("FetchReach", "Reacher")}
-    ps = [c.p_text(records["contrastive"], records["oracle"], goals.BUDGETS[task]) for task, records in states.items()]
-    quote = f"`contrastive` is level with the oracle on FetchReach ({ps[0]}) and worse on Reacher ({ps[1]})"
-    verdicts = [c.verdict(records["contrastive"], records["oracle"], goals.BUDGETS[task]) for task, records in states.items()]
-    yield Sentence(ALGORITHMS, quote, states["Reacher"]["contrastive"].name, verdicts == ["level", "worse"])
+    states = {task: variants(GOALS, task) for task in ("FetchReach", "PointMass", "Reacher")}
+    pairs = [(records["contrastive"], records["oracle"], goals.BUDGETS[task]) for task, records in states.items()]
+    quote = (
+        "`contrastive` is level with the oracle on FetchReach ({}), better on PointMass ({}) and worse on Reacher ({})".format(
+            *(c.p_text(*pair) for pair in pairs)
+        )
+    )
+    is_so = [c.verdict(*pair) for pair in pairs] == ["level", "better", "worse"]
+    yield Sentence(ALGORITHMS, quote, states["Reacher"]["contrastive"].name, is_so)
 
 
 def _weightings() -> Iterator[Sentence]:
     def verdicts(records: dict[str, Record], reference: str, budget: int) -> dict[str, str]:
         return {name: c.verdict(record, records[reference], budget) for name, record in records.items() if name != reference}
 
-    fetch, finger = (variants(WEIGHTINGS, task) for task in (FETCH, FINGER))
+    fetch, hand, finger = (variants(WEIGHTINGS, task) for task in (FETCH, HAND, FINGER))
     steps = weightings.BUDGETS
+    records = {FETCH: fetch, HAND: hand, FINGER: finger}
+
+    def p(task: str, first: str, second: str) -> str:
+        return c.p_text(records[task][first], records[task][second], steps[task])
+
     order = sorted(fetch, key=lambda name: -fetch[name].means(steps[FETCH]).mean())
     against_sum, against_none = (verdicts(fetch, reference, steps[FETCH]) for reference in ("sum", "none"))
     quote = (
@@ -99,18 +117,37 @@ def _weightings() -> Iterator[Sentence]:
     yield Sentence(WEIGHTING, quote, fetch["imtl_g"].name)
     quote = "`imtl_g` is unstable: in each seed success falls by more than half at some time"
     yield Sentence(WEIGHTING, quote, fetch["imtl_g"].name, min(falls) > 0.5)
-    against_none = verdicts(finger, "none", steps[FINGER])
-    count, p = len(finger) - 1, _p_of_all(finger, "none", steps[FINGER])
-    quote = f"On FingerTurn five auxiliary losses help with each of {count} weightings** ({p})"
-    yield Sentence(WEIGHTING, quote, finger["sum"].name, set(against_none.values()) == {"better"})
-    against_sum = verdicts({name: record for name, record in finger.items() if name != "none"}, "sum", steps[FINGER])
-    first = [c.p_text(finger[name], finger["sum"], steps[FINGER]) for name in ("uncertainty", "imtl_l", "ol_aux_5")]
-    quote = "`uncertainty` and `imtl_l` are better than the plain sum ({} and {}), the others, `ol_aux_5` included ({})".format(
-        *first
+    helped = {HAND: hand, FINGER: finger}
+    is_supported = all(set(verdicts(records, "none", steps[task]).values()) == {"better"} for task, records in helped.items())
+    quote = "auxiliary losses help with every weighting** ({} on HandReach, {}; {} on FingerTurn, {})".format(
+        *(part for task, records in helped.items() for part in (len(records) - 1, _p_of_all(records, "none", steps[task])))
     )
-    better = {name for name, value in against_sum.items() if value == "better"}
-    is_supported = better == {"uncertainty", "imtl_l"} and "worse" not in against_sum.values()
+    yield Sentence(WEIGHTING, quote, hand["sum"].name, is_supported)
+    against_sum = verdicts(hand, "sum", steps[HAND])
+    quote = (
+        f"better than the plain sum** ({p(HAND, 'ol_aux_5', 'sum')}), than the thesis's baseline `balance` "
+        f"({p(HAND, 'ol_aux_5', 'balance')}), and level with `gradvac` ({p(HAND, 'ol_aux_5', 'gradvac')}), the only other "
+        f"weighting that beats the sum ({p(HAND, 'gradvac', 'sum')})"
+    )
+    is_level = c.verdict(hand["ol_aux_5"], hand["gradvac"], steps[HAND]) == "level"
+    is_supported = _with_verdict("better", against_sum) == {"ol_aux_5", "gradvac"} and is_level
+    yield Sentence(WEIGHTING, quote, hand["ol_aux_5"].name, is_supported)
+    quote = f"level with the sum on FetchReach ({p(FETCH, 'ol_aux_5', 'sum')}) and FingerTurn ({p(FINGER, 'ol_aux_5', 'sum')})"
+    level = [
+        c.verdict(fetch["ol_aux_5"], fetch["sum"], steps[FETCH]),
+        c.verdict(finger["ol_aux_5"], finger["sum"], steps[FINGER]),
+    ]
+    yield Sentence(WEIGHTING, quote, finger["ol_aux_5"].name, level == ["level", "level"])
+    scales = {"uncertainty", "imtl_l"}
+    quote = f"(better than the sum, {p(FINGER, 'uncertainty', 'sum')} and {p(FINGER, 'imtl_l', 'sum')})"
+    is_supported = _with_verdict("better", verdicts(finger, "sum", steps[FINGER])) == scales
     yield Sentence(WEIGHTING, quote, finger["uncertainty"].name, is_supported)
+    quote = f"the worst on HandReach** (worse than the sum, {p(HAND, 'uncertainty', 'sum')})"
+    yield Sentence(WEIGHTING, quote, hand["uncertainty"].name, _with_verdict("worse", against_sum) == {*scales, "none"})
+
+
+def _with_verdict(verdict: str, verdicts: dict[str, str]) -> set[str]:
+    return {name for name, value in verdicts.items() if value == verdict}
 
 
 def _greatest_fall(record: Record, seed: int) -> float:
@@ -120,9 +157,9 @@ def _greatest_fall(record: Record, seed: int) -> float:
 
 
 def _p_of_all(records: dict[str, Record], reference: str, budget: int) -> str:
-    """Format the p-value against a reference that all other records share."""
-    values = {c.p_text(record, records[reference], budget) for name, record in records.items() if name != reference}
-    return " to ".join(sorted(values))
+    """Format the least and the greatest p-value of all other records against a reference, one if they are equal."""
+    values = sorted({c.p_text(record, records[reference], budget) for name, record in records.items() if name != reference})
+    return values[0] if len(values) == 1 else f"{values[0]} to {values[-1]}"
 
 
 def sentences() -> list[Sentence]:
