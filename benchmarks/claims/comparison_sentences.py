@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.claims import columns as c
 from benchmarks.claims import goals, weightings
 from benchmarks.claims.prose import Sentence
-from benchmarks.claims.records import Record, variants
+from benchmarks.claims.records import Record, runs, variants
 from jaxrl_vis.studies.goals import FAMILY as GOALS
 from jaxrl_vis.studies.goals import POINT
 from jaxrl_vis.studies.indicator import FETCH, FINGER, HAND, REACHER, SAWYER
@@ -87,6 +87,13 @@ def _goals() -> Iterator[Sentence]:
     yield Sentence(ALGORITHMS, quote, states["Reacher"]["contrastive"].name, is_so)
 
 
+def _shifts() -> Iterator[Sentence]:
+    by_pixels = runs("contrastive_shift")
+    final = [by_pixels[name].median() for name in ("0", "1", "6", "1_rgbd")]
+    quote = "{0:.2f} at 96 k; with shifts of 1 pixel {1:.2f} (from RGB-D {3:.2f}), of 6 pixels {2:.2f}".format(*final)
+    yield Sentence(ALGORITHMS, quote, by_pixels["0"].name, final[:3] == sorted(final[:3], reverse=True))
+
+
 def _weightings() -> Iterator[Sentence]:
     def verdicts(records: dict[str, Record], reference: str, budget: int) -> dict[str, str]:
         return {name: c.verdict(record, records[reference], budget) for name, record in records.items() if name != reference}
@@ -164,4 +171,4 @@ def _p_of_all(records: dict[str, Record], reference: str, budget: int) -> str:
 
 def sentences() -> list[Sentence]:
     """Return the sentences of this module."""
-    return [*_goals(), *_weightings()]
+    return [*_goals(), *_shifts(), *_weightings()]

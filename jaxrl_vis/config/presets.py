@@ -209,8 +209,9 @@ def _algorithm_overrides(config: Config, algorithm: str) -> dict[str, Any]:
     if algorithm == "ddpg":
         return {}
     own: dict[str, Any] = {"critic_states": False}
-    if algorithm == "contrastive":  # goals are future states
+    if algorithm == "contrastive":  # goals are future states, and an observation would be known by its goal's shift
         own |= {"future_goals": "geometric", "relabel_probability": 1.0, "balance_probability": 0.0, "trivial_goals": 1.0}
+        own["random_shift"] = 0
     return own
 
 

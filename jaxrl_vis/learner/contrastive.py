@@ -67,14 +67,16 @@ def _check(setup: Setup) -> None:
     """Check that the algorithm supports a configuration.
 
     Raises:
-        RequestError: It sets a reward or auxiliary losses, which this algorithm ignores, another sampling of goals than
-            geometric future states, or several devices per learner.
+        RequestError: It sets a reward or auxiliary losses, which this algorithm ignores, random shifts, another sampling of
+            goals than geometric future states, or several devices per learner.
     """
     config = setup.config
     if config.reward.method != "oracle":
         raise RequestError(f"contrastive reads no rewards: leave out --method {config.reward.method}")
     if config.auxiliary.aux_tasks:
         raise RequestError("contrastive has no auxiliary losses: leave out --aux-tasks")
+    if config.network.random_shift:
+        raise RequestError("contrastive would know a goal by its shift, that of its observation: leave out --random-shift")
     goals = config.goals
     following = dataclasses.replace(goals, relabel_probability=1.0, trivial_goals=1.0, future_goals="geometric")
     for field in dataclasses.fields(goals):

@@ -180,12 +180,19 @@ def test_the_last_step_is_its_only_goal_and_no_goal_lies_outside():
         ({"relabel_probability": 0.9}, "relabel_probability must be 1.0, not 0.9"),
         ({"future_goals": "even"}, "future_goals must be geometric, not even"),
         ({"balance_probability": 0.5}, "no balance_probability 0.5"),
+        ({"random_shift": 1}, "know a goal by its shift, that of its observation: leave out --random-shift"),
     ],
 )
 def test_what_it_does_not_read_is_refused(changes, message):
     chosen = config(**changes)
     with pytest.raises(RequestError, match=message):
         make(setup(chosen.replace(aux_tasks=(), weighting="none"), config=chosen))
+
+
+@pytest.mark.parametrize("name", ["fast", "cpu"])
+def test_presets_of_image_tasks_shift_no_images_for_it(name):
+    for env in ("VisualFetchReach", "VisualHandReach", "VisualPointMass"):
+        assert preset(name, env=env, algorithm="contrastive").network.random_shift == 0
 
 
 def test_devices_do_not_share_a_batch():
