@@ -33,7 +33,7 @@ from render_comparison import BOUNDS, Tally, surface_kinds  # noqa: E402
 
 from benchmarks.ledger.markers import fill  # noqa: E402
 from benchmarks.rendering import model_folder  # noqa: E402
-from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
+from benchmarks.rendering.reference import ReferenceRenderer  # noqa: E402
 
 TARGET = ROOT / "benchmarks" / "results" / "render_parity.json"
 PAGE = ROOT / "docs" / "lab" / "renderer_parity.md"

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.claims.permutation import permutation_p_value
 from benchmarks.ledger.markers import WIDTH
 from benchmarks.ledger.records import RESULTS
 from jaxrl_vis.config import config_from_dict
@@ -18,7 +19,7 @@ from jaxrl_vis.report.plots import format_steps
 from jaxrl_vis.run.storage.folder import read_record
 from jaxrl_vis.run.storage.metrics import read_rows
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
-from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
+from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean
 
 SUCCESS = "eval/success"
 RELEASED_DECAY = 0.98

@@ -18,7 +18,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "envs"), str(ROOT / "tests")]
 import render_models  # noqa: E402
 import render_references  # noqa: E402
 
-from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
+from benchmarks.rendering.reference import ReferenceRenderer  # noqa: E402
 
 POSES, HEIGHT, WIDTH = 3, 72, 96
 STEPS = 60  # physics steps of random actions before each pose

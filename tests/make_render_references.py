@@ -18,7 +18,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "envs"), str(ROOT / "tests")]
 import render_models  # noqa: E402
 import render_references  # noqa: E402
 
-from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
+from benchmarks.rendering.reference import ReferenceRenderer  # noqa: E402
 
 # Fewer and smaller than in the live comparison (benchmarks/render_parity.py): together they stay well under 5 MB.
 POSES, HEIGHT, WIDTH = 4, 72, 96

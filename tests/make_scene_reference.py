@@ -12,7 +12,7 @@ import pathlib
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.render.reference import ReferenceRenderer
+from benchmarks.rendering.reference import ReferenceRenderer
 
 HEIGHT, WIDTH, IMAGES, SEED = 60, 80, 6, 0
 TARGET = pathlib.Path(__file__).parent / "data" / "render_references.npz"

@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.claims.permutation import permutation_p_value
 from benchmarks.claims.records import DISTANCE, SUCCESS, Record
 from jaxrl_vis.report.plots import format_steps
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
-from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
+from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean
 
 SIGNIFICANT = 0.05
 AUTHORS = "authors"

@@ -10,10 +10,10 @@ import render_models
 from render_comparison import Tally, surface_kinds
 
 from benchmarks.pixels import playground
+from benchmarks.rendering.reference import ReferenceRenderer
 from jaxrl_vis_envs import pixels
 from jaxrl_vis_envs.compiling.compilation import compiler_options
 from jaxrl_vis_envs.render import Frame
-from jaxrl_vis_envs.render.reference import ReferenceRenderer
 
 ENVIRONMENTS, STEPS = 4, 20  # starts, and random actions from each to a second image
 

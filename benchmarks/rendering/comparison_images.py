@@ -22,8 +22,8 @@ import render_models  # noqa: E402
 from PIL import Image, ImageDraw, ImageFont  # noqa: E402
 from render_features import FEATURES  # noqa: E402
 
+from benchmarks.rendering.reference import ReferenceRenderer  # noqa: E402
 from jaxrl_vis_envs.render import Scene  # noqa: E402
-from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
 
 FOLDER = ROOT / "docs" / "renderer"
 SIZE, GAP, TITLE = 144, 4, 18  # pixels

@@ -23,11 +23,11 @@ import render_models
 from PIL import Image
 from render_comparison import dilated, matched_shares, near_edges
 
+from benchmarks.rendering.reference import ReferenceRenderer
 from jaxrl_vis.bench.scenes.models import forward, scatter_joints
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.render import Frame, Scene
 from jaxrl_vis_envs.render.camera import camera_pose, pixel_rays, ray_parts
-from jaxrl_vis_envs.render.reference import ReferenceRenderer
 
 SUFFIXES = (".xml", ".mjcf", ".urdf")
 VOID = 0.002  # fraction of an image; if less of it shows an object, there is nothing to compare

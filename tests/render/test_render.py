@@ -11,9 +11,9 @@ import pytest
 from mujoco import mjx
 
 import jaxrl_vis_envs
+from benchmarks.rendering.reference import ReferenceRenderer
 from jaxrl_vis_envs.render import Scene, render, render_planes
 from jaxrl_vis_envs.render.mounts import Mount
-from jaxrl_vis_envs.render.reference import ReferenceRenderer
 
 REFERENCES = pathlib.Path(__file__).parents[1] / "data" / "render_references.npz"
 POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "site_xpos", "site_xmat")

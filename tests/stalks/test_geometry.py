@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
 from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
 from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image
+from jaxrl_vis.stalks.phenotyping.measure.behind import depths_behind
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.lens import VALIDATED, lens_fault
 from jaxrl_vis.stalks.phenotyping.report.tables import Origin, plot_rows
@@ -336,15 +338,56 @@ def test_disparities_that_agree_behind_the_row_beat_better_correlations_that_do_
     assert depths[3:] == pytest.approx([54.2 / 34] * 3, abs=0.04)
 
 
+def narrow_stalks(shift: int) -> tuple[np.ndarray, np.ndarray, list[Detection]]:
+    """Return a pair of stalks 6 pixels wide, too narrow for windows, before a textured wall, and their perfect detections."""
+    rng = np.random.default_rng(0)
+    wall = cv2.GaussianBlur(rng.integers(0, 255, (400, 900, 3)).astype(np.uint8), (5, 5), 0)
+    left, right = wall[:, :844].copy(), wall[:, 20:864].copy()  # at a disparity of 20 pixels
+    finds = []
+    for column in (60, *COLUMNS):
+        texture = rng.integers(60, 255, (400, 6, 1)).astype(np.uint8)
+        left[:, column : column + 6] = right[:, column - shift : column - shift + 6] = texture
+        mask = np.zeros((200, 16), bool)
+        mask[:, 5:11] = True
+        box = (column, 100.0, column + 5.0, 300.0)
+        finds.append(Detection(box, (column + 2.5, column + 2.5), 1.0, mask, (100, column - 5)))
+    return left, right, finds
+
+
+def test_narrow_stalks_behind_the_row_are_placed_there():
+    """A stalk further to the left than the disparity of the row would not be in the right image: that one is not known."""
+    left, right, finds = narrow_stalks(34)
+    depths = [sighting.depth_m for sighting in measure_pair(finds, left, right, CAMERA)]
+    assert depths[1:] == pytest.approx([54.2 / 34] * 6, abs=0.02)
+    for shift, row_depth, wanted in ((34, 0.8, True), (34, 1.4, False), (50, 0.6, True), (50, 0.8, False), (34, None, True)):
+        left, right, finds = narrow_stalks(shift)
+        grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
+        behind = depths_behind(finds, grey[0], grey[1], CAMERA, row_depth)
+        assert np.isfinite(behind[1:]).all() == np.isfinite(behind[1:]).any() == wanted
+        assert math.isnan(depths_behind(finds, grey[0], grey[1], CAMERA, 0.8)[0])
+    assert len(depths_behind([], grey[0], grey[1], CAMERA, 0.8)) == 0
+
+
+def test_given_disparities_tell_what_stands_behind_the_row():
+    left, right, finds = narrow_stalks(34)
+    disparity = np.full(left.shape[:2], np.nan, np.float32)
+    for find, value in zip(finds[1:], (34.0, 34.0, 68.0, 68.0, 68.0)):
+        first = find.corner[1] + 5
+        disparity[100:300, first : first + 6] = value
+    finds[1].mask[:150] = False  # what little is seen of it counts
+    disparity[:140, finds[2].corner[1] :][:, :16] = np.nan
+    behind = depths_behind(finds, left, right, CAMERA, 0.8, disparity=disparity)
+    np.testing.assert_allclose(behind[1:3], 54.2 / 34, rtol=1e-6)
+    assert np.isnan(behind[3:]).all()
+
+
 def test_a_stalk_of_the_row_that_is_mostly_occluded_is_not_placed_behind_it():
-    """In the right image a leaf covers most of it, and something similar is where a stalk behind would be."""
+    """In the right image a leaf covers most of it."""
     left, right, finds = stalks_at(68)
     random = np.random.default_rng(0)
     for column in COLUMNS[-3:]:
         stalk = right[:, column - 68 : column - 54]
         stalk[:150] = stalk[220:] = random.integers(0, 255, 3)
-        noise = random.integers(-40, 40, (400, 14, 3))
-        right[:, column - 34 : column - 20] = np.clip(left[:, column : column + 14].astype(int) + noise, 0, 255)
     depths = [sighting.depth_m for sighting in measure_pair(finds, left, right, CAMERA)]
     assert depths[:3] == pytest.approx([54.2 / 68] * 3, abs=0.02)
     assert depths[3:] == [None] * 3 or depths[3:] == pytest.approx([54.2 / 68] * 3, abs=0.02)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
+from benchmarks.claims.permutation import permutation_p_value
+from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean
 
 
 def test_the_interquartile_mean_leaves_out_the_outer_quarters_of_all_scores():

@@ -18,7 +18,6 @@ Modules, in the order in which data passes through them; each imports only from 
                  nearest object per pixel; its depth, normal, texture and colour
     cpu/, gpu/   the same image, faster: in passes over tiles on a CPU, in one kernel on an NVIDIA GPU
     images       `render` and `render_planes`, which select one of the three
-    reference    MuJoCo's own OpenGL renderer with the same `Frame`, for tests and videos
 
 Each fast path reproduces the plain path in `pixel`, including its derivatives, for the scenes that it supports. The path is
 selected by the platform that a program is compiled for (`jaxrl_vis_envs.compiling.compilation.dispatch_by_platform`).

@@ -16,9 +16,6 @@ from jaxrl_vis_envs.plants import Calibration
 Method = Literal["strip", "ellipse"]
 DEPTHS = (0.5, 1.3)
 """Minimum and maximum depth of the stalks of a row, m."""
-_BEHIND = 4.0  # m: depth up to which stalks behind the row are matched, as by day they would be matched with nearer ones
-_CLEARLY = 1.25  # factor of the correlations behind the row to those in it: windows of a stalk also match by chance
-_MAX_TILT = math.radians(30.0)  # of a stalk: a larger one is a mismatch
 _WINDOWS = 16
 _REACH = 0.025  # m along a stalk, within which edges are measured: sheaths and nodes beyond have no effect
 
@@ -94,7 +91,8 @@ def measure_stalk(
         return Measurement(reason="too few lines show both edges")
     confidence = strip.confidence
     place = strip.reference if row is None else row - corner[0]
-    matched = _disparity(strip, corner, left, right, calibration, depths, disparity)
+    far, near = (float(calibration.disparity(np.array(depth))) for depth in depths[::-1])
+    matched = stalk_disparity(strip, corner, left, right, calibration, (far, near), disparity)
     if ground is not None and height is not None:
         place = _row_at_height(height, strip, corner, matched, calibration, ground)
     disparity_here = matched.at(place + corner[0])
@@ -114,7 +112,6 @@ def measure_stalk(
     half = 0.5 * pixels / math.cos(strip.lean)
     edges = tuple((middle + corner[1] + side * half, place + corner[0]) for side in (-1.0, 1.0))
     tilt = _tilt(matched, shift, calibration)
-    tilt = tilt if abs(tilt) < _MAX_TILT else 0.0
     diameter = diameter_mm(calibration, edges[0], edges[1], depth, strip.lean, tilt)
     # Away from the middle of the visible part, the error of the slopes adds to that of the edges.
     span = max(strip.last - strip.first, 1)
@@ -164,33 +161,6 @@ def _row_at_height(
     return float(np.interp(-height, [-height_here for height_here in heights], ends))
 
 
-def _disparity(
-    strip: Strip,
-    corner: tuple[int, int],
-    left: np.ndarray,
-    right: np.ndarray,
-    calibration: Calibration,
-    depths: tuple[float, float],
-    disparity: np.ndarray | None,
-) -> StalkDisparity:
-    """Compute the disparities of a stalk within a range of depths, m, or behind it.
-
-    Those behind must agree on an upright stalk, and correlate clearly more if those within the range agree, too. A stalk of the
-    row that others partly occlude matches in a few windows only, and by chance in many behind the row, but less well. See
-    `stalk_disparity`.
-    """
-    behind, far, near = (float(calibration.disparity(np.array(depth))) for depth in (_BEHIND, *depths[::-1]))
-    row = strip.reference + corner[0]
-    in_row = stalk_disparity(strip, corner, left, right, calibration, (far, near), disparity)
-    wanted = 0.0 if in_row.at(row) is None else _CLEARLY * in_row.scores.sum()
-    if wanted >= in_row.window_count:  # no correlation exceeds 1
-        return in_row
-    matched = stalk_disparity(strip, corner, left, right, calibration, (behind, far), disparity)
-    is_partly_occluded = in_row.usual_score() > matched.usual_score() and in_row.is_consistent()
-    there = matched.at(row) if matched.scores.sum() > wanted and not is_partly_occluded else None
-    return in_row if there is None or abs(_tilt(matched, there[0], calibration)) > _MAX_TILT else matched
-
-
 def stalk_disparity(
     strip: Strip,
     corner: tuple[int, int],
@@ -219,7 +189,7 @@ def stalk_disparity(
 
 
 def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -> float:
-    """Return the tilt of the stalk away from the camera, rad; 0 if the matched segment is too short.
+    """Return the tilt of the stalk away from the camera, rad; 0 if the matched segment is too short or the tilt implausible.
 
     Args:
         matched: Disparities of the stalk.
@@ -230,4 +200,5 @@ def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -
         return 0.0
     first, second = index_pairs(matched.rows.size, 3)
     slopes = (matched.values[second] - matched.values[first]) / (matched.rows[second] - matched.rows[first])
-    return tilt_from_disparity(median(slopes), disparity, calibration)
+    tilt = tilt_from_disparity(median(slopes), disparity, calibration)
+    return tilt if abs(tilt) < math.radians(30.0) else 0.0

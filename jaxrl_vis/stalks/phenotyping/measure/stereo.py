@@ -5,7 +5,7 @@ informative about its distance. Three methods:
 
     match_rows     one-dimensional: windows of a few rows of the stalk are compared at every integer disparity by normalised
                    cross-correlation, and refined by a parabola through the maximum and its neighbours. The default.
-    match_sgbm     OpenCV's semi-global matching of the detection's strip; the thesis applied it to the whole image.
+    match_sgbm     OpenCV's semi-global matching of a part of the images; the thesis applied it to whole images.
     sample_rows    samples a disparity image from another source.
 
 `match_rows` assumes one depth per window, which nearly holds on a stalk, and rejects windows with an ambiguous match or none.
@@ -42,17 +42,6 @@ class StalkDisparity:
     values: np.ndarray
     scores: np.ndarray
     window_count: int
-
-    def usual_score(self) -> float:
-        """Return the median correlation of the matched windows; 0 if there are none."""
-        return median(self.scores) if self.scores.size else 0.0
-
-    def is_consistent(self) -> bool:
-        """Return True unless most of the matched windows, and more than two, disagree with the median disparity."""
-        if not self.values.size:
-            return True
-        outliers = np.count_nonzero(np.abs(self.values - median(self.values)) > _SCATTER)
-        return bool(outliers <= max(2, self.values.size / 2))
 
     def at(self, row: float) -> tuple[float, float] | None:
         """Estimate the disparity in an image row by a robust straight-line fit to the windows.
@@ -247,13 +236,16 @@ def _subpixel_peak(score: np.ndarray) -> tuple[float, float] | None:
     return column + min(max(fraction, -0.5), 0.5), height
 
 
-def match_sgbm(left: np.ndarray, right: np.ndarray, box: tuple[int, int, int, int], bounds: tuple[float, float]) -> np.ndarray:
+def match_sgbm(
+    left: np.ndarray, right: np.ndarray, box: tuple[int, int, int, int], bounds: tuple[float, float], block: int = 7
+) -> np.ndarray:
     """Compute the disparities of all pixels of a box by semi-global matching.
 
     Args:
         left, right: Rectified images [H, W] or [H, W, 3] uint8.
         box: Left, top, right and bottom, pixels; right and bottom are exclusive.
         bounds: Minimum and maximum disparity, pixels.
+        block: Height and width of the compared blocks, pixels.
 
     Returns:
         Disparities [h, w] float32, pixels; NaN where unmatched.
@@ -272,9 +264,9 @@ def match_sgbm(left: np.ndarray, right: np.ndarray, box: tuple[int, int, int, in
     matcher = cv2.StereoSGBM_create(
         minDisparity=low,
         numDisparities=count,
-        blockSize=7,
-        P1=8 * channels * 49,
-        P2=32 * channels * 49,
+        blockSize=block,
+        P1=8 * channels * block**2,
+        P2=32 * channels * block**2,
         disp12MaxDiff=1,
         uniquenessRatio=10,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxrl_vis.config import fields
 from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection
+from jaxrl_vis.stalks.phenotyping.measure.behind import depths_behind
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_rows, find_ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement, Method, measure_stalk
@@ -264,7 +265,17 @@ def measure_pair(
         if ground is not None and detection.upper is not None:
             upper = measure_stalk(*detection.upper, *images, height=HEIGHTS[1], **how)
         measured.append((measurement, upper))
-    measured = _without_mismatches(measured, calibration, find_frame(grey_right).columns[0])
+    first_column = find_frame(grey_right).columns[0]
+    row_depth = _row_depth(measured)
+    behind = depths_behind(detections, grey_left, grey_right, calibration, row_depth, first_column, disparity)
+    row_depth = _row_depth([pair for pair, is_behind in zip(measured, np.isfinite(behind)) if not is_behind])
+    for place in np.flatnonzero(np.isfinite(behind)):
+        here, depth = measured[place][0], float(behind[place])
+        # Windows that match by chance do so at any depth, not just at the row's.
+        if here.diameter_mm is None or row_depth is None or abs(here.depth - row_depth) > _SAME_DEPTH:
+            away = f"it stands {depth:.2f} m away"
+            measured[place] = Measurement(row=here.row, depth=depth, lean=here.lean, reason=away), None
+    measured = _without_mismatches(measured, calibration, first_column)
     occluded = _occluded_edges([measurement for measurement, _ in measured])
     above = _occluded_edges([upper or Measurement() for _, upper in measured])
     occluded = [behind or not measurement.both_edges_visible for behind, (measurement, _) in zip(occluded, measured)]
@@ -280,6 +291,12 @@ def measure_pair(
     return sightings
 
 
+def _row_depth(measured: list[tuple[Measurement, Measurement | None]]) -> float | None:
+    """Return the depth of the row in a pair, m; None if fewer than three stalks were measured."""
+    depths = [measurement.depth for measurement, _ in measured if measurement.diameter_mm is not None]
+    return near_row_depth(depths) if len(depths) >= MIN_STALKS else None
+
+
 def _without_mismatches(
     measured: list[tuple[Measurement, Measurement | None]], calibration: Calibration, first_column: int
 ) -> list[tuple[Measurement, Measurement | None]]:
@@ -290,10 +307,9 @@ def _without_mismatches(
         calibration: Calibration of the cameras.
         first_column: First column of the right image without a black border.
     """
-    depths = [measurement.depth for measurement, _ in measured if measurement.diameter_mm is not None]
-    if len(depths) < MIN_STALKS:
+    row_depth = _row_depth(measured)
+    if row_depth is None:
         return measured
-    row_depth = near_row_depth(depths)
     disparity = float(calibration.disparity(np.array(row_depth)))
     valid = []
     for measurement, upper in measured:

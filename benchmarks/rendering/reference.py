@@ -1,4 +1,4 @@
-"""MuJoCo's own OpenGL renderer with the interface of `Frame`: ground truth for tests, and better-looking images for videos.
+"""MuJoCo's own OpenGL renderer with the interface of `Frame`, the reference of tests and benchmarks.
 
 It needs a GL library (``MUJOCO_GL=egl`` or ``osmesa`` without a display), makes one MuJoCo call per image, and uses NumPy only.
 GL is initialised when a `ReferenceRenderer` is constructed, not on import.
