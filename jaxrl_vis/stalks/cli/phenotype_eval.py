@@ -27,7 +27,7 @@ class Eval(EvaluationOptions):
     """Number of plots."""
     method: Literal["strip", "ellipse"] = "strip"
     """Method of measuring widths: between two edges (strip), or by ellipses as in the thesis."""
-    min_score: float = 0.5
+    min_score: float = 0.4
     """Minimum score of a detection that counts as a stalk, 0 to 1; without effect with --masks truth."""
     thesis: bool = False
     """Also score the thesis's methods (ellipses, semi-global matching, stalks per metre of image) on the same detections."""

@@ -34,7 +34,7 @@ class Run(CameraOptions):
     """Source of masks: the networks, or the ground truth of synthetic plots, to evaluate everything downstream of the masks."""
     method: Literal["strip", "ellipse"] = "strip"
     """Method of measuring widths: between two edges (strip), or by ellipses as in the thesis."""
-    min_score: float = 0.5
+    min_score: float = 0.4
     """Minimum score of a detection that counts as a stalk, 0 to 1; without effect with --masks truth."""
     disparity_scale: float = 256.0
     """Scale of 16-bit disparity files (disparity_000.png beside the images): their values divided by it are pixels. 256 for

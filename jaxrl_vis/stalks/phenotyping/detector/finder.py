@@ -172,7 +172,7 @@ class Finder:
     Args:
         params: Parameters with keys ``detector`` and ``segmenter``.
         settings: Settings stored with the weights.
-        min_score: Minimum score of a detection; 0.5 balances misses against false detections.
+        min_score: Minimum score of a detection; 0.4 balances misses against false detections.
         gate: Gate that estimates how likely each image is misread; None if there is none for these weights.
         substitute: Detector for images of unknown cameras, and for those that the gate finds unfamiliar; None for this one.
 
@@ -185,7 +185,7 @@ class Finder:
         self,
         params: Any,
         settings: Settings,
-        min_score: float = 0.5,
+        min_score: float = 0.4,
         gate: Gate | None = None,
         substitute: Self | None = None,
     ) -> None:

@@ -48,7 +48,7 @@ class Task:
     weights: Path | None
     finder: str = "truth"
     method: Method = "strip"
-    min_score: float = 0.5
+    min_score: float = 0.4
     thesis: bool = False
     workers: int = 1
 

@@ -78,7 +78,7 @@ def score_plot(
     seed: int,
     find: Find | None,
     method: Method = "strip",
-    min_score: float = 0.5,
+    min_score: float = 0.4,
     with_thesis: bool = False,
 ) -> PlotScore:
     """Render a plot, run the whole pipeline on it, and score the results.
@@ -234,7 +234,7 @@ def average_precision(detections: np.ndarray, stalks: int) -> float:
     return float(np.where(place < len(precision), precision[np.minimum(place, len(precision) - 1)], 0.0).mean())
 
 
-def summarize_scores(scores: Iterable[PlotScore], min_score: float = 0.5) -> dict[str, Any]:
+def summarize_scores(scores: Iterable[PlotScore], min_score: float = 0.4) -> dict[str, Any]:
     """Summarize the scores of plots.
 
     Args:
