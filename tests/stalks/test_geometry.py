@@ -366,6 +366,8 @@ def test_narrow_stalks_behind_the_row_are_placed_there():
         assert np.isfinite(behind[1:]).all() == np.isfinite(behind[1:]).any() == wanted
         assert math.isnan(depths_behind(finds, grey[0], grey[1], CAMERA, 0.8)[0])
     assert len(depths_behind([], grey[0], grey[1], CAMERA, 0.8)) == 0
+    in_millimetres = dataclasses.replace(CAMERA, baseline=100.0)  # disparities of 100,000 pixels would be searched
+    assert np.isnan(depths_behind(finds, grey[0], grey[1], in_millimetres, 0.8)).all()
 
 
 def test_given_disparities_tell_what_stands_behind_the_row():

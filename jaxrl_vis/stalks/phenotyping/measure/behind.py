@@ -47,10 +47,10 @@ def depths_behind(
         that would be outside the right image if they stood in the row.
     """
     depths = np.full(len(detections), np.nan)
-    if not detections:
-        return depths
     row_depth = DEPTHS[1] - _BEHIND if row_depth is None else row_depth
     bounds = calibration.disparity(np.array([_FARTHEST, row_depth + _BEHIND, row_depth, DEPTHS[0]]))
+    if not detections or bounds[3] >= left.shape[1]:  # a baseline in centimetres: nothing near would be in both images
+        return depths
     scale, dense = 1.0, disparity
     if dense is None:
         scale = min(_WIDTH / left.shape[1], 1.0)
