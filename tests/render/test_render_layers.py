@@ -6,7 +6,7 @@ from test_packaging import imports_within
 ROOMS = (
     ("mounts",),
     ("model", "outputs", "viewpoint"),
-    ("scene", "reference", "cords"),
+    ("scene", "cords"),
     ("camera",),
     ("pixel",),
     ("cpu", "gpu"),
