@@ -76,7 +76,9 @@ def _check(setup: Setup) -> None:
     if config.auxiliary.aux_tasks:
         raise RequestError("contrastive has no auxiliary losses: leave out --aux-tasks")
     if config.network.random_shift:
-        raise RequestError("contrastive would know a goal by its shift, that of its observation: leave out --random-shift")
+        raise RequestError(
+            "contrastive would recognise a goal by its shift, which its observation has, too: leave out --random-shift"
+        )
     goals = config.goals
     following = dataclasses.replace(goals, relabel_probability=1.0, trivial_goals=1.0, future_goals="geometric")
     for field in dataclasses.fields(goals):

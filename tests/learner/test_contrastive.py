@@ -180,7 +180,7 @@ def test_the_last_step_is_its_only_goal_and_no_goal_lies_outside():
         ({"relabel_probability": 0.9}, "relabel_probability must be 1.0, not 0.9"),
         ({"future_goals": "even"}, "future_goals must be geometric, not even"),
         ({"balance_probability": 0.5}, "no balance_probability 0.5"),
-        ({"random_shift": 1}, "know a goal by its shift, that of its observation: leave out --random-shift"),
+        ({"random_shift": 1}, "recognise a goal by its shift, which its observation has, too: leave out --random-shift"),
     ],
 )
 def test_what_it_does_not_read_is_refused(changes, message):
