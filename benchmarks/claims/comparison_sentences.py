@@ -1,13 +1,14 @@
-"""Sentences on figures ``goals`` and ``weightings`` in docs/algorithms.md and docs/weighting.md; see `prose`."""
+"""Sentences on figures ``goals`` and ``weightings`` and on contrastive RL, in docs/algorithms.md, weighting.md and tasks.md; see `prose`."""
 
 from collections.abc import Iterator
 
 import numpy as np
 
 from benchmarks.claims import columns as c
-from benchmarks.claims import goals, weightings
+from benchmarks.claims import contrastive_view, goals, weightings
 from benchmarks.claims.prose import Sentence
 from benchmarks.claims.records import Record, runs, variants
+from jaxrl_vis.report.plots import format_steps
 from jaxrl_vis.studies.goals import FAMILY as GOALS
 from jaxrl_vis.studies.goals import POINT
 from jaxrl_vis.studies.indicator import FETCH, FINGER, HAND, REACHER, SAWYER
@@ -94,6 +95,13 @@ def _shifts() -> Iterator[Sentence]:
     yield Sentence(ALGORITHMS, quote, by_pixels["0"].name, final[:3] == sorted(final[:3], reverse=True))
 
 
+def _view() -> Iterator[Sentence]:
+    record = runs(contrastive_view.FOLDER)["contrastive_cpu"]
+    level = record.steps_to(0.9)
+    quote = f"`stable` reaches 0.9 at {format_steps(level) if level else 'no time'} and {record.median():.2f} at 100 k"
+    yield Sentence(contrastive_view.GUIDE, quote, record.name)
+
+
 def _weightings() -> Iterator[Sentence]:
     def verdicts(records: dict[str, Record], reference: str, budget: int) -> dict[str, str]:
         return {name: c.verdict(record, records[reference], budget) for name, record in records.items() if name != reference}
@@ -171,4 +179,4 @@ def _p_of_all(records: dict[str, Record], reference: str, budget: int) -> str:
 
 def sentences() -> list[Sentence]:
     """Return the sentences of this module."""
-    return [*_goals(), *_shifts(), *_weightings()]
+    return [*_goals(), *_shifts(), *_view(), *_weightings()]

@@ -9,10 +9,12 @@ GUIDE, FOLDER = "docs/tasks.md", "contrastive_view"
 _METHODS = {
     "indicator_balance_filter": "`indicator_balance_filter`",
     "oracle": "`oracle`",
-    "contrastive": "`contrastive`, `stable`",
-    "contrastive_nce": "`contrastive`, `nce`",
-    "contrastive_1M": "`contrastive`, `stable`",
-    "contrastive_nce_1M": "`contrastive`, `nce`",
+    "contrastive_cpu": "`contrastive`, `stable`; preset `cpu`",
+    "contrastive_nce_cpu": "`contrastive`, `nce`; preset `cpu`",
+    "contrastive": "`contrastive`, `stable`; shifted images",
+    "contrastive_nce": "`contrastive`, `nce`; shifted images",
+    "contrastive_1M": "`contrastive`, `stable`; shifted images",
+    "contrastive_nce_1M": "`contrastive`, `nce`; shifted images",
 }
 """Method by name of the run, in the order of the rows."""
 _EARLY = 15_000
