@@ -1,4 +1,4 @@
-"""Sentences on figures ``goals`` and ``weightings`` and on contrastive RL, in docs/algorithms.md, weighting.md and tasks.md; see `prose`."""
+"""Sentences on figures ``goals`` and ``weightings`` and on contrastive RL, in the guides of these; see `prose`."""
 
 from collections.abc import Iterator
 
