@@ -96,10 +96,12 @@ def _shifts() -> Iterator[Sentence]:
 
 
 def _view() -> Iterator[Sentence]:
-    record = runs(contrastive_view.FOLDER)["contrastive_cpu"]
-    level = record.steps_to(0.9)
-    quote = f"`stable` reaches 0.9 at {format_steps(level) if level else 'no time'} and {record.median():.2f} at 100 k"
-    yield Sentence(contrastive_view.GUIDE, quote, record.name)
+    records = runs(contrastive_view.FOLDER)
+    stable, nce = records["contrastive_cpu"], records["contrastive_nce_cpu"]
+    level, budget = stable.steps_to(0.9), stable.end
+    reached = f"`stable` reaches 0.9 at {format_steps(level) if level else 'no time'} and {stable.median():.2f} at 100 k"
+    quote = f"{reached}, and is better than `nce` ({c.p_text(stable, nce, budget)})"
+    yield Sentence(contrastive_view.GUIDE, quote, stable.name, c.verdict(stable, nce, budget) == "better")
 
 
 def _weightings() -> Iterator[Sentence]:
