@@ -266,16 +266,8 @@ def measure_pair(
             upper = measure_stalk(*detection.upper, *images, height=HEIGHTS[1], **how)
         measured.append((measurement, upper))
     first_column = find_frame(grey_right).columns[0]
-    row_depth = _row_depth(measured)
-    behind = depths_behind(detections, grey_left, grey_right, calibration, row_depth, first_column, disparity)
-    row_depth = _row_depth([pair for pair, is_behind in zip(measured, np.isfinite(behind)) if not is_behind])
-    for place in np.flatnonzero(np.isfinite(behind)):
-        here, depth = measured[place][0], float(behind[place])
-        # Windows that match by chance do so at any depth, not just at the row's.
-        if here.diameter_mm is None or row_depth is None or abs(here.depth - row_depth) > _SAME_DEPTH:
-            away = f"it stands {depth:.2f} m away"
-            measured[place] = Measurement(row=here.row, depth=depth, lean=here.lean, reason=away), None
-    measured = _without_mismatches(measured, calibration, first_column)
+    depths = depths_behind(detections, grey_left, grey_right, calibration, _row_depth(measured), first_column, disparity)
+    measured = _without_mismatches(_place_behind(measured, depths), calibration, first_column)
     occluded = _occluded_edges([measurement for measurement, _ in measured])
     above = _occluded_edges([upper or Measurement() for _, upper in measured])
     occluded = [behind or not measurement.both_edges_visible for behind, (measurement, _) in zip(occluded, measured)]
@@ -289,6 +281,24 @@ def measure_pair(
         sighting = _make_sighting(detection, less, upper, calibration)
         sightings.append(dataclasses.replace(sighting, occluded=behind[0], upper_occluded=behind[1]))
     return sightings
+
+
+def _place_behind(
+    measured: list[tuple[Measurement, Measurement | None]], depths: np.ndarray
+) -> list[tuple[Measurement, Measurement | None]]:
+    """Replace measurements by the depths [N] of stalks behind the row, NaN for others, unless they are at the row's depth.
+
+    Windows that match by chance do so at any depth.
+    """
+    is_behind = np.isfinite(depths)
+    row_depth = _row_depth([pair for pair, behind in zip(measured, is_behind) if not behind])
+    placed = []
+    for (lower, upper), behind, depth in zip(measured, is_behind, map(float, depths)):
+        if behind and (lower.diameter_mm is None or row_depth is None or abs(lower.depth - row_depth) > _SAME_DEPTH):
+            lower = Measurement(row=lower.row, depth=depth, lean=lower.lean, reason=f"it stands {depth:.2f} m away")
+            upper = None
+        placed.append((lower, upper))
+    return placed
 
 
 def _row_depth(measured: list[tuple[Measurement, Measurement | None]]) -> float | None:
