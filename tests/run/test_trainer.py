@@ -24,6 +24,7 @@ from jaxrl_vis.run.storage import metrics
 from jaxrl_vis.run.storage.checkpoint import Checkpoints
 from jaxrl_vis.run.storage.folder import RunFolder, default_folder, read_config
 from jaxrl_vis.run.trained import restored_run
+from jaxrl_vis.run.trained.results import describe
 
 
 def test_a_run_reports_logs_and_draws(straight, capsys):
@@ -201,6 +202,11 @@ def test_init_takes_one_key_or_one_per_seed():
 def test_names_of_default_folders():
     assert default_folder(Config()) == Path("runs/VisualFetchReach-oracle-fast-seed0")
     assert default_folder(Config().replace(seeds=5)).name == "VisualFetchReach-oracle-fast-seeds0to4"
+    assert default_folder(Config().replace(algorithm="contrastive")).name == "VisualFetchReach-contrastive-fast-seed0"
+    assert default_folder(Config().replace(algorithm="td3")).name == "VisualFetchReach-td3-oracle-fast-seed0"
+    own = Config().replace(algorithm="mine:Own", method="theirs:Reward")
+    assert default_folder(own).name == "VisualFetchReach-mine-Own-theirs-Reward-fast-seed0"
+    assert describe(Config().replace(algorithm="contrastive")) == "contrastive, preset fast, seed 0"
 
 
 def test_metrics_file_survives_a_torn_line(tmp_path):

@@ -42,14 +42,21 @@ EXPORT_FOLDER = "export"
 """Folder of exported policies (`jaxrl_vis.run.exported`)."""
 
 
+def learner_name(config: Config) -> str:
+    """Return the reward method, after the algorithm if that is not DDPG, or `contrastive`, which has no rewards."""
+    algorithm, method = config.run.algorithm, config.reward.method
+    return {"ddpg": method, "contrastive": algorithm}.get(algorithm, f"{algorithm} {method}")
+
+
 def default_folder(config: Config) -> Path:
-    """Return ``runs/<env>-<method>-<preset>-seed<first>`` or ``...-seeds<first>to<last>``, below the working directory.
+    """Return ``runs/<env>-<learner>-<preset>-seed<first>`` or ``...-seeds<first>to<last>``, below the working directory.
 
     The colon of ``module:Name`` becomes a hyphen, because Windows does not allow it in file names.
     """
     last = config.run.seed + config.run.seeds - 1
     seeds = f"seed{config.run.seed}" if config.run.seeds == 1 else f"seeds{config.run.seed}to{last}"
-    return Path("runs") / f"{config.environment.env.replace(':', '-')}-{config.reward.method}-{config.run.preset}-{seeds}"
+    name = f"{config.environment.env}-{learner_name(config)}-{config.run.preset}-{seeds}"
+    return Path("runs") / name.replace(":", "-").replace(" ", "-")
 
 
 def check_resumable(path: Path, resume: bool) -> None:

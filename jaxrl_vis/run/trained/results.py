@@ -8,18 +8,18 @@ from jaxrl_vis.report import videos
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.loggers.console import format_seconds
 from jaxrl_vis.run.loggers.group import Loggers
-from jaxrl_vis.run.storage.folder import RunFolder
+from jaxrl_vis.run.storage.folder import RunFolder, learner_name
 from jaxrl_vis.run.storage.progress import Progress
 
 
 def describe(config: Config) -> str:
-    """Summarise a configuration in a few words: method, preset and seeds."""
+    """Summarise a configuration in a few words: algorithm, method, preset and seeds."""
     seeds = (
         f"seed {config.run.seed}"
         if config.run.seeds == 1
         else f"seeds {config.run.seed} to {config.run.seed + config.run.seeds - 1}"
     )
-    return f"{config.reward.method}, preset {config.run.preset}, {seeds}"
+    return f"{learner_name(config)}, preset {config.run.preset}, {seeds}"
 
 
 class Results:
