@@ -19,6 +19,7 @@ import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, TypeVar
@@ -33,6 +34,7 @@ Record = dict[str, Any]
 A = TypeVar("A")
 T = TypeVar("T")
 
+_PATIENCE = 1.0  # s without a result after which the workers are looked at
 # Variables that limit the threads of NumPy, SciPy, OpenCV and XLA in a process.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC")
 
@@ -106,16 +108,22 @@ def worker_pool(workers: int) -> Iterator[UnorderedMap]:
         workers, mp_context=spawning, initializer=_prepare, initargs=(counter, _worker_env_vars(workers))
     )
 
+    children: set[BaseProcess] = set()
+
     def submit(function: Callable[[A], T], argument: A) -> Future[T]:
         with shielded_children():  # may start a process, which only this one may end: see `_prepare`
-            return pool.submit(function, argument)
+            future = pool.submit(function, argument)
+        children.update(set(multiprocessing.active_children()) - others)
+        return future
 
     def unordered_map(function: Callable[[A], T], arguments: Iterable[A]) -> Iterator[T]:
         arguments = iter(arguments)
         # Two pending calls per worker, so that none waits for this process.
         waiting = {submit(function, argument) for argument in itertools.islice(arguments, 2 * workers)}
         while waiting:
-            ready, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            ready, waiting = wait(waiting, _PATIENCE, FIRST_COMPLETED)
+            if not ready and any(child.exitcode is not None for child in children):
+                raise BrokenProcessPool("a worker was killed while it sent a result")
             waiting |= {submit(function, argument) for argument in itertools.islice(arguments, len(ready))}
             for result in ready:
                 yield result.result()
@@ -123,18 +131,27 @@ def worker_pool(workers: int) -> Iterator[UnorderedMap]:
     try:
         yield unordered_map
     except BrokenProcessPool as error:
-        pool.shutdown()  # not left to the end of this process, where the pool's thread may close what that writes to
+        _kill(pool, children)
         raise WorkerError(
             f"one of {workers} processes was killed from outside, most likely because memory ran out: use fewer --workers"
         ) from error
     except BaseException as error:
-        for child in set(multiprocessing.active_children()) - others:
-            child.kill()
-        pool.shutdown(cancel_futures=True)
+        _kill(pool, children)
         if is_out_of_memory(error):
             raise WorkerError(f"memory ran out in one of {workers} processes, which share it: use fewer --workers") from error
         raise
     pool.shutdown()
+
+
+def _kill(pool: ProcessPoolExecutor, children: Iterable[BaseProcess]) -> None:
+    """Kill the worker processes of a pool, and wait for its thread to end."""
+    results = pool._result_queue
+    for child in children:
+        child.kill()
+    if results is not None:
+        # Of a worker killed while it sent a result, the pool's thread would wait for the rest until the last writer is closed.
+        results._writer.close()
+    pool.shutdown(cancel_futures=True)
 
 
 def share_accelerator() -> None:

@@ -6,11 +6,13 @@ import json
 import multiprocessing
 import os
 import signal
+import struct
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import ModuleType
 
@@ -62,6 +64,17 @@ def killed(number: int) -> Record:
     os._exit(9)
 
 
+def killed_while_sending(number: int) -> None:
+    """Let this process end with the header of its result, which the pool's thread then waits for the rest of."""
+    send = Connection._send  # type: ignore[attr-defined]
+
+    def send_header(self: Connection, content: bytes) -> None:
+        send(self, struct.pack("!i", len(content)))
+        os._exit(9)
+
+    Connection._send = send_header  # type: ignore[attr-defined]
+
+
 def signalled(number: int) -> Record:
     """Send all signals to this process, as somebody would who signals the whole process group."""
     for item in signals.SIGNALS:
@@ -101,6 +114,14 @@ def test_what_goes_wrong_in_a_process_is_reported():
     assert not set(threading.enumerate()) - before
     with pytest.raises(WorkerError, match="was killed from outside"):
         evaluate_all(killed, range(3), 2, results.__setitem__)
+    assert not set(threading.enumerate()) - before
+
+
+def test_a_worker_killed_while_it_sends_a_result_is_reported():
+    """Regression test: half a result was waited for forever, at the end of a training with many workers, too."""
+    before = set(threading.enumerate())
+    with pytest.raises(WorkerError, match="was killed from outside"):
+        list(map_unordered(killed_while_sending, itertools.count(), 2))
     assert not set(threading.enumerate()) - before
 
 
