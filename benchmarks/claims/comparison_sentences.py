@@ -97,11 +97,18 @@ def _shifts() -> Iterator[Sentence]:
 
 def _view() -> Iterator[Sentence]:
     records = runs(contrastive_view.FOLDER)
-    stable, nce = records["contrastive_cpu"], records["contrastive_nce_cpu"]
+    stable, nce = records["contrastive"], records["contrastive_nce"]
     level, budget = stable.steps_to(0.9), stable.end
     reached = f"`stable` reaches 0.9 at {format_steps(level) if level else 'no time'} and {stable.median():.2f} at 100 k"
-    quote = f"{reached}, and is better than `nce` ({c.p_text(stable, nce, budget)})"
-    yield Sentence(contrastive_view.GUIDE, quote, stable.name, c.verdict(stable, nce, budget) == "better")
+    quote = f"{reached}, level with `nce` ({c.p_text(stable, nce, budget)})"
+    yield Sentence(contrastive_view.GUIDE, quote, stable.name, c.verdict(stable, nce, budget) == "level")
+    others = [
+        (records["contrastive_cpu"], records["contrastive_nce_cpu"]),
+        (records["own_contrastive"], records["own_contrastive_nce"]),
+    ]
+    quote = "better than `nce` ({} and {})".format(*(c.p_text(*pair, budget) for pair in others))
+    is_better = all(c.verdict(*pair, budget) == "better" for pair in others)
+    yield Sentence(contrastive_view.GUIDE, quote, others[0][0].name, is_better)
 
 
 def _weightings() -> Iterator[Sentence]:

@@ -9,12 +9,14 @@ GUIDE, FOLDER = "docs/tasks.md", "contrastive_view"
 _METHODS = {
     "indicator_balance_filter": "`indicator_balance_filter`",
     "oracle": "`oracle`",
+    "contrastive": "`contrastive`, `stable`",
+    "contrastive_nce": "`contrastive`, `nce`",
+    "contrastive_1M": "`contrastive`, `stable`",
     "contrastive_cpu": "`contrastive`, `stable`; preset `cpu`",
     "contrastive_nce_cpu": "`contrastive`, `nce`; preset `cpu`",
-    "contrastive": "`contrastive`, `stable`; shifted images",
-    "contrastive_nce": "`contrastive`, `nce`; shifted images",
-    "contrastive_1M": "`contrastive`, `stable`; shifted images",
-    "contrastive_nce_1M": "`contrastive`, `nce`; shifted images",
+    "own_contrastive_rgb": "`contrastive`, `stable`; own view",
+    "own_contrastive": "`contrastive`, `stable`; own view, RGB-D",
+    "own_contrastive_nce": "`contrastive`, `nce`; own view, RGB-D",
 }
 """Method by name of the run, in the order of the rows."""
 _EARLY = 15_000
