@@ -1,8 +1,8 @@
 """Leave-one-out training of the stalk detector: `python -m benchmarks.stalks.factors FOLDER --check MODULE:FUNCTION`.
 
-For each group of factors of plots by day, networks are trained for equal times on the family ``daylight`` without it, starting
-from the shipped weights, and evaluated on photographs. FOLDER gets the weights of each training and its record, GROUP.json;
-groups that have a record are skipped. Records in `RESULTS` are the table of docs/lab/real_stalks.md.
+For each group of factors of plots by day, networks are trained with equally many updates on the family ``daylight`` without it,
+starting from the shipped weights, and evaluated on photographs. FOLDER gets the weights of each training and its record,
+GROUP.json; groups that have a record are skipped. Records in `RESULTS` are the table of docs/lab/real_stalks.md.
 
 FUNCTION(find) evaluates a detector, ``find(image [H, W, 3] uint8) -> (boxes [N, 4], scores [N])``, and returns cells of the
 table by column, such as ``{"plants found": "3 of 4"}``: photographs do not ship with this project.
@@ -61,14 +61,16 @@ class Training:
     """Settings that all trainings share.
 
     Attributes:
-        minutes: Duration of each training in minutes, including compilation.
+        steps: Number of updates.
+        minutes: Maximum duration of each training in minutes, including compilation.
         workers: Number of processes that render plots.
         images: Maximum number of training images.
         rate: Peak learning rate.
         seed: Random seed.
     """
 
-    minutes: float = 8.0
+    steps: int = 4000
+    minutes: float = 30.0
     workers: int = 14
     images: int = 6000
     rate: float = 5e-4
@@ -90,11 +92,18 @@ def train(group: str, folder: Path, training: Training) -> Path:
 
     family, weights = folder / f"{_stem(group)}.spec.json", folder / f"{_stem(group)}.safetensors"
     family.write_text(json.dumps(spec(group), indent=1))
-    options = {**dataclasses.asdict(training), "spec": family, "start": SHIPPED, "steps": 1_000_000}
+    options = {**dataclasses.asdict(training), "spec": family, "start": SHIPPED}
     arguments = [word for name, value in options.items() for word in (f"--{name}", str(value))]
     if subprocess.run([sys.executable, "-m", "jaxrl_vis", "phenotype", "train", str(weights), *arguments]).returncode:
         sys.exit(f"the training without {group} failed, see above; the same command goes on with it")
     return weights
+
+
+def count_updates(weights: Path) -> int:
+    """Return the number of updates with which a weights file was trained."""
+    from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights
+
+    return read_weights(weights)[2]["steps"]
 
 
 def evaluate(weights: Path, check: Callable[[Find], dict[str, str]]) -> dict[str, str]:
@@ -131,8 +140,15 @@ def main() -> None:
         record = options.folder / f"{_stem(group)}.json"
         if record.exists():
             continue
-        cells = evaluate(train(group, options.folder, training), check)
-        about = {"group": group, "training": dataclasses.asdict(training), "revision": revision(), "device": device_name()}
+        weights = train(group, options.folder, training)
+        about = {
+            "group": group,
+            "training": dataclasses.asdict(training),
+            "revision": revision(),
+            "device": device_name(),
+            "updates": count_updates(weights),
+        }
+        cells = evaluate(weights, check)
         write_atomically(record, json.dumps({**about, "cells": cells}, indent=1) + "\n")
         print(f"without {group}: {cells}", flush=True)
 

@@ -32,11 +32,11 @@ def test_rows_are_in_the_order_of_the_groups(tmp_path: Path) -> None:
     assert factors_table(tmp_path) is None
     folder = tmp_path / "factors"
     folder.mkdir()
-    about = {"training": {"minutes": 8.0}, "revision": "abcdef0123", "device": "A GPU"}
+    about = {"updates": 4000, "revision": "abcdef0123", "device": "A GPU"}
     for name, group, found in (("a", "walls", "2 of 4"), ("b", factors.NOTHING, "4 of 4")):
         record = {**about, "group": group, "cells": {"plants found": found, "control": "0 of 24"}}
         (folder / f"{name}.json").write_text(json.dumps(record))
     assert factors_table(tmp_path) == (
-        "| trained without | plants found | control |\n|---|---|---|\n"
-        "| nothing | 4 of 4 | 0 of 24 |\n| walls | 2 of 4 | 0 of 24 |\n\n8 minutes each.\nMade by abcdef0 on A GPU."
+        "| trained without | updates | plants found | control |\n|---|---|---|---|\n"
+        "| nothing | 4,000 | 4 of 4 | 0 of 24 |\n| walls | 4,000 | 2 of 4 | 0 of 24 |\n\nMade by abcdef0 on A GPU."
     )

@@ -14,13 +14,12 @@ def factors_table(results: Path) -> str | None:
     if not records:
         return None
     columns = list(next(iter(records.values()))["cells"])
-    lines = [f"| trained without | {' | '.join(columns)} |", "|" + "---|" * (len(columns) + 1)]
+    lines = [f"| trained without | updates | {' | '.join(columns)} |", "|" + "---|" * (len(columns) + 2)]
     lines += [
-        f"| {group} | {' | '.join(records[group]['cells'][column] for column in columns)} |"
+        f"| {group} | {records[group]['updates']:,} | {' | '.join(records[group]['cells'][column] for column in columns)} |"
         for group in WITHOUT
         if group in records
     ]
-    training = next(iter(records.values()))["training"]
     origins = frozenset(f"{(record['revision'] or 'unknown')[:7]} on {record['device']}" for record in records.values())
     made = origin_sentence([Record("factors", (), origins)])
-    return "\n".join([*lines, "", f"{training['minutes']:g} minutes each.", made])
+    return "\n".join([*lines, "", made])
