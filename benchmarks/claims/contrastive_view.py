@@ -17,6 +17,7 @@ _METHODS = {
     "own_contrastive_rgb": "`contrastive`, `stable`; own view",
     "own_contrastive": "`contrastive`, `stable`; own view, RGB-D",
     "own_contrastive_nce": "`contrastive`, `nce`; own view, RGB-D",
+    "own_contrastive_cpu_1M": "`contrastive`, `stable`; own view, RGB-D, preset `cpu`",
 }
 """Method by name of the run, in the order of the rows."""
 _EARLY = 15_000
