@@ -122,7 +122,7 @@ def worker_pool(workers: int) -> Iterator[UnorderedMap]:
         waiting = {submit(function, argument) for argument in itertools.islice(arguments, 2 * workers)}
         while waiting:
             ready, waiting = wait(waiting, _PATIENCE, FIRST_COMPLETED)
-            if not ready and any(child.exitcode is not None for child in children):
+            if not ready and any(child.exitcode for child in children):
                 raise BrokenProcessPool("a worker was killed while it sent a result")
             waiting |= {submit(function, argument) for argument in itertools.islice(arguments, len(ready))}
             for result in ready:
