@@ -34,9 +34,9 @@ Record = dict[str, Any]
 A = TypeVar("A")
 T = TypeVar("T")
 
-_PATIENCE = 1.0  # s without a result after which the workers are looked at
 # Variables that limit the threads of NumPy, SciPy, OpenCV and XLA in a process.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC")
+_CHECK_INTERVAL = 1.0  # s without a result after which workers that ended are looked for
 
 
 def evaluate_all(
@@ -107,7 +107,6 @@ def worker_pool(workers: int) -> Iterator[UnorderedMap]:
     pool = ProcessPoolExecutor(
         workers, mp_context=spawning, initializer=_prepare, initargs=(counter, _worker_env_vars(workers))
     )
-
     children: set[BaseProcess] = set()
 
     def submit(function: Callable[[A], T], argument: A) -> Future[T]:
@@ -121,7 +120,7 @@ def worker_pool(workers: int) -> Iterator[UnorderedMap]:
         # Two pending calls per worker, so that none waits for this process.
         waiting = {submit(function, argument) for argument in itertools.islice(arguments, 2 * workers)}
         while waiting:
-            ready, waiting = wait(waiting, _PATIENCE, FIRST_COMPLETED)
+            ready, waiting = wait(waiting, _CHECK_INTERVAL, FIRST_COMPLETED)
             if not ready and any(child.exitcode for child in children):
                 raise BrokenProcessPool("a worker was killed while it sent a result")
             waiting |= {submit(function, argument) for argument in itertools.islice(arguments, len(ready))}
