@@ -22,6 +22,8 @@ _FORBIDDEN_COST = 1e3  # cost of an assignment outside the gates
 # Gates of the tracker, lengths in m.
 _ALONG = 0.018  # maximum distance along the row between a track and a sighting assigned to it
 _DEPTH = 0.05  # maximum difference of their depths
+_STALE = 3  # pairs since the last depth of a track behind the row after which stalks of the row claim its place first
+_ROW_FIRST_COST = 2.0  # more than the cost of any assignment within the gates
 _MERGE = 0.015  # maximum distance along the row between two tracks of one stalk, which are merged
 _MERGE_ACROSS_DEPTHS = 0.005  # the same for tracks of different depth, with the rays of one evaluated at the depth of the other
 _MAX_SHARED = 0.34  # maximum fraction of the pairs of the shorter track in which both are seen, to merge them
@@ -97,6 +99,11 @@ class _OpenTrack:
         """Return the position along the row, m, assuming a depth in m."""
         return float(np.median([offset + ray * depth for offset, ray in self.rays]))
 
+    def is_stale(self, frame: int) -> bool:
+        """Return True if no depth was measured in the last pairs before ``frame``."""
+        measured = [number for (number, _), depth in zip(self.sightings, self.depth) if math.isfinite(depth)]
+        return not measured or frame - measured[-1] >= _STALE
+
     def locate(self) -> tuple[float, float]:
         """Return the median position along the row and depth of the last nine sightings, m; NaN for an unknown depth."""
         depths = [depth for depth in self.depth[-9:] if math.isfinite(depth)]
@@ -129,12 +136,12 @@ def track_stalks(
     for frame, sightings in enumerate(frames):
         view = _PairView.of(sightings, calibration, usual)
         positions[frame] = driven[frame] + correction
-        pairs = _assign(tracks, view, positions[frame])
+        pairs = _assign(tracks, view, positions[frame], frame)
         moves = [tracks[track].locate()[0] - view.along[new] - positions[frame] for track, new in pairs if view.is_in_row[new]]
         if len(moves) >= 3:
             correction += float(np.median(moves))
             positions[frame] = driven[frame] + correction
-            pairs = _assign(tracks, view, positions[frame])
+            pairs = _assign(tracks, view, positions[frame], frame)
         taken = {new: track for track, new in pairs}
         for new in map(int, np.flatnonzero(view.is_candidate)):
             depth = float(view.depth[new]) if view.is_measured[new] else math.nan
@@ -251,8 +258,11 @@ def _are_distinct(sightings: list[Sighting]) -> np.ndarray:
     return own
 
 
-def _assign(tracks: list[_OpenTrack], view: _PairView, position: float) -> list[tuple[int, int]]:
-    """Assign sightings to tracks by minimum cost; return pairs (track, sighting) of indices, each used at most once."""
+def _assign(tracks: list[_OpenTrack], view: _PairView, position: float, frame: int) -> list[tuple[int, int]]:
+    """Assign sightings to tracks by minimum cost; return pairs (track, sighting) of indices, each used at most once.
+
+    A sighting without depth, seen where a track behind the row would be by now, more likely shows a stalk of the row before it.
+    """
     if not tracks or not view.rays.size:
         return []
     there = np.array([track.locate() for track in tracks])
@@ -260,7 +270,9 @@ def _assign(tracks: list[_OpenTrack], view: _PairView, position: float) -> list[
     along = np.where(view.is_measured, view.along, [view.along_at(depth) for _, depth in there]) + position
     aside = np.abs(there[:, :1] - along) / _ALONG
     away = np.nan_to_num(np.abs(there[:, 1:] - view.depth[None]) / _DEPTH, nan=0.4)
-    cost = np.where((aside < 1.0) & (away < 1.0) & view.is_candidate, aside + 0.5 * away, _FORBIDDEN_COST)
+    is_stale = np.array([track.is_stale(frame) for track in tracks]) & (there[:, 1] > view.usual + _MAX_ROW_OFFSET)
+    price = aside + 0.5 * away + _ROW_FIRST_COST * (is_stale[:, None] & np.isnan(view.depth))
+    cost = np.where((aside < 1.0) & (away < 1.0) & view.is_candidate, price, _FORBIDDEN_COST)
     rows, columns = linear_sum_assignment(cost)
     return [(int(row), int(column)) for row, column in zip(rows, columns) if cost[row, column] < _FORBIDDEN_COST]
 

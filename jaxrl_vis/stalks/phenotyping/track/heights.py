@@ -19,11 +19,11 @@ USUAL_TAPER = 0.405
 """Taper of the thesis, mm per inch, for plots with too few stalks measured at both heights."""
 _TAPER_SPREAD = 0.3  # relative standard deviation of the taper of stalks within a plot
 _MIN_SIGHTINGS = 5
-_MIN_CLEAR = 3  # number of sightings without an occluded edge from which the others are ignored
-_OCCLUDED_QUANTILE = 0.85
+_OCCLUDED_QUANTILE = 0.85  # of measurements with an occluded edge, which are lower bounds
+_OCCLUDED_WEIGHT = 4.0  # factor of their weights: their confidence, a tenth of others', is that of a diameter, not of a bound
 # Errors common to all pairs, which their scatter does not show; estimated on synthetic stalks.
 _MASK_ERROR = 0.7  # pixels: bias of masks on one texture
-_OCCLUSION_ERROR = 0.8  # mm, if an edge may be occluded in all pairs
+_OCCLUSION_ERROR = 1.5  # mm, if an edge may be occluded in all pairs
 _CALIBRATION_ERROR = 0.005  # relative: focal length and baseline of a good calibration
 _FEW = 2.0  # pairs: correction for the underestimated scatter of few pairs
 _MAX_OFFSET = 4.0 * INCH  # m: maximum distance of a measurement from a height
@@ -36,7 +36,7 @@ class Width:
     """Diameter of a stalk, estimated from all its sightings.
 
     Attributes:
-        mm: Weighted median of the diameters, mm; a higher quantile if too few sightings show both edges.
+        mm: Weighted median of the diameters, mm; those with an occluded edge count as lower bounds.
         error: Standard error, mm: from the scatter between pairs, the common bias of masks, occluded edges, and a good
             calibration. Intervals of +/- 2 standard errors cover about 95 % of synthetic stalks.
         scatter: Standard error from the scatter between pairs alone, mm, at least that from the errors of edges and disparity.
@@ -177,28 +177,40 @@ def robust_width(sightings: list[Sighting]) -> Width | None:
 
 
 def _combine(values: list[_WidthMeasurement]) -> Width | None:
-    """Estimate a width as the weighted median of the measurements with both edges visible; None if there are none at all.
+    """Estimate a width as the weighted median of its measurements; None if there are none.
 
-    If there are too few of these, all measurements are used, and the 0.85 quantile instead of the median, as measurements with
-    an occluded edge are lower bounds.
+    Measurements with an occluded edge are lower bounds: these count with their 0.85 quantile, so that the width minimises the
+    weighted sum of their quantile losses and of the absolute differences from the others.
     """
-    clear = [value for value in values if not value.occluded]
-    used, quantile = (clear, 0.5) if len(clear) >= _MIN_CLEAR or len(clear) == len(values) else (values, _OCCLUDED_QUANTILE)
-    if not used:
+    if not values:
         return None
-    widths, stated, weights = np.array([(value.mm, value.deviation or 0.0, value.confidence) for value in used]).T
-    weights = np.maximum(weights, 0.02)
-    order = np.argsort(widths)
-    passed = np.cumsum(weights[order]) - 0.5 * weights[order]
-    middle = float(np.interp(quantile * weights.sum(), passed, widths[order]))
+    widths, stated, weights = np.array([(value.mm, value.deviation or 0.0, value.confidence) for value in values]).T
+    occluded = np.array([value.occluded for value in values])
+    weights = np.maximum(weights, 0.02) * np.where(occluded, _OCCLUDED_WEIGHT, 1.0)
+    middle = _joint_quantile(widths, weights, np.where(occluded, _OCCLUDED_QUANTILE, 0.5))
     enough = float(weights.sum() ** 2 / (weights**2).sum())
     scatter = 1.4826 * float(np.median(np.abs(widths - middle))) * 1.2533 if len(widths) > 2 else 0.0
     mean_error = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
     of_pairs = max(scatter, mean_error) / math.sqrt(enough)
     error = math.hypot(
         of_pairs * math.sqrt(1.0 + _FEW / len(widths)),
-        _MASK_ERROR * float(np.median([value.pixel for value in used])),
-        _OCCLUSION_ERROR * (1.0 - len(clear) / len(values)),
+        _MASK_ERROR * float(np.median([value.pixel for value in values])),
+        _OCCLUSION_ERROR * float(weights[occluded].sum() / weights.sum()),
         _CALIBRATION_ERROR * middle,
     )
     return Width(middle, error, of_pairs, len(widths))
+
+
+def _joint_quantile(values: np.ndarray, weights: np.ndarray, quantiles: np.ndarray) -> float:
+    """Return the minimiser of a weighted sum of quantile losses, interpolated between values as in a weighted median.
+
+    Args:
+        values: Values [N] float64.
+        weights: Weight [N] float64 of each value.
+        quantiles: Quantile [N] float64 that each value counts with, 0 to 1.
+    """
+    order = np.argsort(values)
+    below, above = (weights * (1.0 - quantiles))[order], (weights * quantiles)[order]
+    # The slope of the loss halfway through the step at each value.
+    slope = np.cumsum(below) - 0.5 * below - (above.sum() - np.cumsum(above) + 0.5 * above)
+    return float(np.interp(0.0, slope, values[order]))

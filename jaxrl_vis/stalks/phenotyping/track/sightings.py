@@ -30,7 +30,8 @@ USUAL_DISTANCE = 0.8
 _OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is found at the usual one
 _SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
 _FAR_FROM_ROW = 0.2  # m: distance from the row beyond which a match is suspicious
-_OCCLUSION_FACTOR = 0.1  # factor of the confidence of a sighting with an edge that may be occluded
+# Factor of the confidence of a measurement with an edge that may be occluded; at 24 inches, fewer of these are lower bounds.
+_OCCLUSION_FACTOR, _UPPER_OCCLUSION_FACTOR = 0.1, 0.025
 _BEHIND = 0.003  # m: a stalk further behind occludes nothing
 _TOUCHING = 0.1  # of half a stalk's width: distance within which edges touch
 _SAME_DEPTH = 0.06  # m: change of depth over 12 inches of a stalk that leans by 10 degrees
@@ -272,14 +273,12 @@ def measure_pair(
     above = _occluded_edges([upper or Measurement() for _, upper in measured])
     occluded = [behind or not measurement.both_edges_visible for behind, (measurement, _) in zip(occluded, measured)]
     sightings = []
-    for detection, (measurement, upper), *behind in zip(detections, measured, occluded, above):
-        less = (
-            dataclasses.replace(measurement, confidence=measurement.confidence * _OCCLUSION_FACTOR)
-            if behind[0]
-            else measurement
-        )
-        sighting = _make_sighting(detection, less, upper, calibration)
-        sightings.append(dataclasses.replace(sighting, occluded=behind[0], upper_occluded=behind[1]))
+    for detection, (measurement, upper), hidden, upper_hidden in zip(detections, measured, occluded, above):
+        lower = dataclasses.replace(measurement, confidence=measurement.confidence * (_OCCLUSION_FACTOR if hidden else 1.0))
+        if upper is not None and upper_hidden:
+            upper = dataclasses.replace(upper, confidence=upper.confidence * _UPPER_OCCLUSION_FACTOR)
+        sighting = _make_sighting(detection, lower, upper, calibration)
+        sightings.append(dataclasses.replace(sighting, occluded=hidden, upper_occluded=upper_hidden))
     return sightings
 
 
