@@ -315,10 +315,16 @@ def test_weights_say_whether_they_detect_sections(tmp_path):
     inside, _, _ = finder.detect_boxes(image, every.pixels_per_metre, lambda column: (9.5, 49.5))
     assert len(anywhere) == len(scores) > 0 and len(inside) > 0
     assert set(anywhere[:, 1].tolist()) <= {0.0, 32.0} and (inside[:, [1, 3]] == [10.0, 50.0]).all()
+    assert anywhere[:, 0].min() < 0.0 or anywhere[:, 2].max() > 64.0
+    clipped = [detection.box for detection in Finder(params, every, 0.0)(image)]
+    assert clipped and all(-0.5 <= left <= right <= 63.5 for left, _, right, _ in clipped)
 
 
-@pytest.mark.parametrize(("threshold", "camera", "is_replaced"), [(2.0, None, True), (2.0, 250.0, False), (-1.0, 250.0, True)])
-def test_images_of_unknown_cameras_and_unfamiliar_ones_are_read_by_other_networks(threshold, camera, is_replaced):
+@pytest.mark.parametrize(
+    ("threshold", "camera", "is_replaced", "is_flagged"),
+    [(3.0, None, True, False), (3.0, 250.0, False, False), (1.5, 250.0, True, False), (-1.0, 250.0, True, True)],
+)
+def test_images_of_unknown_cameras_and_doubtful_ones_are_read_by_other_networks(threshold, camera, is_replaced, is_flagged):
     by_day, gate = load_finder(PHOTOGRAPHS, 0.0), read_gate(SHIPPED)
     assert gate is not None and load_finder(SHIPPED, 0.0)._substitute is by_day
     judged = dataclasses.replace(gate, threshold=threshold)
@@ -328,4 +334,4 @@ def test_images_of_unknown_cameras_and_unfamiliar_ones_are_read_by_other_network
     boxes, others = ([detection.box for detection in found] for found in (detections, by_day(image, camera)))
     assert others and (boxes == others) == is_replaced
     if camera is not None:
-        assert detections.is_unfamiliar == is_replaced  # although other networks have read the image
+        assert detections.is_unfamiliar == is_flagged  # although other networks have read the image

@@ -23,7 +23,10 @@ from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
 _BATCH, _BATCH_ON_ACCELERATOR = 8, 32  # stalk crops per batch
 _MIN_VISIBLE = 0.5  # minimum fraction of a stalk's axis outside black borders
 _MAX_ENLARGED = 3.0  # at more, a stalk is only three pixels wide and cannot be recognised
-_COVERED = 0.3  # minimum fraction of the band that the sections of a stalk cover
+# Fraction of the gate's maximum doubt above which the substitute reads an image: it reads images at night nearly as well, but
+# the networks for these hardly read any by day.
+_SUBSTITUTE_DOUBT = 0.5
+_COVERED = 0.15  # minimum fraction of the band that the sections of a stalk cover: leaves hide much of some stalks
 _MAX_STRETCH = 1.12  # range of stretching in training: the networks accept image heights within this factor
 
 
@@ -37,8 +40,8 @@ class Detection:
     """Stalk detected in the band.
 
     Attributes:
-        box: Left, top, right and bottom of its part in the band, pixels of the whole image; (0, 0) is the centre of the first
-            pixel.
+        box: Left, top, right and bottom of its part in the band, pixels of the whole image, within its columns; (0, 0) is the
+            centre of the first pixel.
         axis: x coordinates of its centre line at the top and bottom of the box, pixels.
         score: Score of the detector, 0 to 1.
         mask: Mask [h, w] of its visible pixels in a part of the image, float32 from 0 to 1, or bool.
@@ -174,7 +177,8 @@ class Finder:
         settings: Settings stored with the weights.
         min_score: Minimum score of a detection; 0.4 balances misses against false detections.
         gate: Gate that estimates how likely each image is misread; None if there is none for these weights.
-        substitute: Detector for images of unknown cameras, and for those that the gate finds unfamiliar; None for this one.
+        substitute: Detector for images of unknown cameras, and for those that the gate doubts half as much as unfamiliar ones;
+            None for this one.
 
     Attributes:
         dtype: Compute dtype of the convolutions.
@@ -208,7 +212,7 @@ class Finder:
             return self._substitute(image, None, band)
         frame = find_frame(image)
         detections = self._find(fill_borders(image, frame), pixels_per_metre, frame, band)
-        if self._substitute is not None and detections.is_unfamiliar:
+        if self._substitute is not None and _is_doubtful(detections):
             # The doubt remains that of the first networks: how accurate their substitutes are there is not well known.
             others = self._substitute(image, pixels_per_metre, band)
             return Detections(others, detections.doubt, detections.max_doubt)
@@ -246,7 +250,7 @@ class Finder:
     def _find(self, image: np.ndarray, pixels_per_metre: float | None, frame: Frame, band: Band | None) -> Detections:
         """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame, in its coordinates.
 
-        ``band`` has the rows of the band in the whole image. An unfamiliar image that a substitute reads is not segmented.
+        ``band`` has the rows of the band in the whole image. An image that a substitute reads is not segmented.
         """
         settings = self._settings
         relative_scale = settings.width / settings.full_width / settings.scale_for(image.shape[1], pixels_per_metre)
@@ -254,7 +258,7 @@ class Finder:
         detections = Detections()
         if self.gate is not None:
             detections = Detections(doubt=self.gate.doubt(pooled, scores), max_doubt=self.gate.threshold)
-        if self._substitute is not None and detections.is_unfamiliar:
+        if self._substitute is not None and _is_doubtful(detections):
             return detections
         selected = scores >= self._min_score
         stalks, scores = stalks[selected], scores[selected]
@@ -274,7 +278,8 @@ class Finder:
         for place, (stalk, score, (mask, corner)) in enumerate(zip(stalks, scores, pieces)):
             if mask.size:
                 left, top, right, bottom, above, below = (float(edge) - 0.5 for edge in stalk)
-                box = (left, top, right, bottom)
+                last = image.shape[1] - 0.5
+                box = (min(max(left, -0.5), last), top, min(max(right, -0.5), last), bottom)
                 axis = (above, below)
                 detections.append(Detection(box, axis, float(score), mask, corner, upper.get(place), strips[place]))
         return detections
@@ -302,10 +307,16 @@ class Finder:
         return np.concatenate(jax.device_get(masks))[: len(stalks)]
 
 
+def _is_doubtful(detections: Detections) -> bool:
+    """Return True if a substitute should read the image of ``detections``."""
+    doubt, limit = detections.doubt, detections.max_doubt
+    return doubt is not None and limit is not None and doubt > _SUBSTITUTE_DOUBT * limit
+
+
 def cut_to_band(chains: list[Chain], scale: tuple[float, float], band: Band | None) -> tuple[np.ndarray, np.ndarray]:
     """Return boxes and axes [N, 6] in the original image, and scores [N], of the parts of chains in the band.
 
-    Chains whose sections cover less than 0.3 of the band are left out.
+    Chains whose sections cover less than 0.15 of the band are left out.
 
     Args:
         chains: Chains in the resized image.

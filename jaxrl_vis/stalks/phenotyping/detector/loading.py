@@ -44,8 +44,7 @@ def _load(weights: Path, digest: str, min_score: float) -> Finder:
 def load_finder(weights: Path, min_score: float) -> Finder:
     """Load the networks; cached by the path and contents of the file within a process.
 
-    With `SHIPPED`, images of unknown cameras, and those that its gate finds unfamiliar, are read by the networks in
-    `PHOTOGRAPHS`.
+    With `SHIPPED`, images of unknown cameras, and those that its gate doubts, are read by the networks in `PHOTOGRAPHS`.
 
     Args:
         weights: Weights file.
