@@ -318,6 +318,10 @@ def test_weights_say_whether_they_detect_sections(tmp_path):
     assert anywhere[:, 0].min() < 0.0 or anywhere[:, 2].max() > 64.0
     clipped = [detection.box for detection in Finder(params, every, 0.0)(image)]
     assert clipped and all(-0.5 <= left <= right <= 63.5 for left, _, right, _ in clipped)
+    known = every.pixels_per_metre, lambda column: (9.5, 49.5)
+    _, scores, _ = finder.detect_boxes(image, *known)
+    of_rows = {round(detection.score, 5) for detection in Finder(params, every, 0.0)(image, *known)}
+    assert of_rows and of_rows <= set(np.round(1.0 - np.sqrt(1.0 - scores.astype(np.float64)), 5).tolist())
 
 
 @pytest.mark.parametrize(
