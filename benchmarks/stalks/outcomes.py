@@ -13,7 +13,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
-from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometry
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries
 
 
 def calibration(path: Path) -> str:
@@ -47,7 +47,7 @@ def plots(path: Path) -> str:
 def odometry(path: Path) -> str:
     """Describe the odometry of one plot: distances in metres by pair."""
     (plot,) = find_plots(path)
-    driven = read_odometry(plot)
+    driven = read_odometries([plot], None)[plot.name]
     if driven is None:
         return "times only" if any(path.glob("od*")) else "none"
     return ", ".join(f"{name} {value:.4f} m" for name, value in driven.items()) or "no row is of a pair"

@@ -6,13 +6,17 @@ largest.
 """
 
 import argparse
+import math
 
+import cv2
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.measure.width import ELLIPSE_FITS, ellipse_width, fit_strip
+from jaxrl_vis.stalks.phenotyping.measure.width import fit_strip
 
 RATIOS = (1.5, 3.0, 6.0, 12.0)
 LEANS = (0.0, 2.0, 8.0, 14.0, 20.0)
+ELLIPSE_FITS = ("pixels", "pixels_direct", "contour", "contour_direct", "contour_ams", "moments")
+"""Methods of fitting an ellipse to a mask. ``pixels``, least squares over all its pixels, is the method of the thesis."""
 
 
 def ideal_strip(width: float, ratio: float, lean: float, position: tuple[float, float], soft: bool) -> np.ndarray:
@@ -63,6 +67,21 @@ def width_by_strip(mask: np.ndarray) -> float | None:
     """Return the width by `fit_strip`; None if it finds none."""
     strip = fit_strip(mask)
     return None if strip is None else strip.width()
+
+
+def ellipse_width(mask: np.ndarray, fit: str) -> float | None:
+    """Return the minor axis of the ellipse fitted to a mask [H, W] bool by one of `ELLIPSE_FITS`; None without 5 points."""
+    row, column = np.nonzero(mask)
+    points = np.stack([column, row], axis=1).astype(np.float32)
+    if fit == "moments":
+        return 4.0 * math.sqrt(max(float(np.linalg.eigvalsh(np.cov(points.T))[0]), 0.0))
+    if fit.startswith("contour"):
+        contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        points = max(contours, key=len).reshape(-1, 2).astype(np.float32)
+    if len(points) < 5:
+        return None
+    fitter = {"direct": cv2.fitEllipseDirect, "ams": cv2.fitEllipseAMS}.get(fit.partition("_")[2], cv2.fitEllipse)
+    return float(min(fitter(points)[1]))
 
 
 def table(positions: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> list[str]:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from odometry_of_plot import read_odometry
 from readers_worker import MEGABYTES, SECONDS, Worker
 from safetensors.numpy import save
 
@@ -28,7 +29,6 @@ from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name, readable
-from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometry
 from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
 from jaxrl_vis.stalks.phenotyping.report.tables import write_rows
 from jaxrl_vis_envs.plants import read

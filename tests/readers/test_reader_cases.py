@@ -8,13 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from odometry_of_plot import read_odometry
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import weights_file
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import read_disparity, read_image
-from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometry
 
 SIZE = {"width": 20, "height": 12}
 OUTLINE = [2, 3, 8, 3, 8, 9]

@@ -395,7 +395,7 @@ def test_disparities(worker):
 @st.composite
 def safetensors(draw: st.DrawFn, arrays: dict[str, np.ndarray], about: dict) -> bytes:
     """Draw a file with corrupted settings, or a corrupted header (names, shapes, types and offsets), or corrupted bytes."""
-    kind = draw(st.sampled_from(("about", "about", "header", "bytes")))
+    kind = draw(st.sampled_from(("about", "about", "about", "header", "bytes")))
     if kind == "about":
         return save(arrays, {"about": json_text(draw(trees(about, 2)))})
     valid = save(arrays, {"about": json_text(about)})

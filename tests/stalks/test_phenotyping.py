@@ -15,7 +15,7 @@ from jaxrl_vis.stalks.phenotyping.measure.edges import refine_edges
 from jaxrl_vis.stalks.phenotyping.measure.ground import _fit_plane, find_ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import measure_stalk
 from jaxrl_vis.stalks.phenotyping.measure.stereo import match_rows, match_sgbm
-from jaxrl_vis.stalks.phenotyping.measure.width import ELLIPSE_FITS, ellipse_width, fit_strip, fit_strip_near
+from jaxrl_vis.stalks.phenotyping.measure.width import ellipse_width, fit_strip, fit_strip_near
 from jaxrl_vis_envs.plants import Calibration
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,9 +39,9 @@ def test_strips_are_as_wide_as_they_are(lean, ratio, bound, soft):
 def test_ellipses_are_biased_as_their_mathematics_says():
     """The variance across a strip of width w is w^2 / 12, that across an ellipse of minor axis w is w^2 / 16."""
     mask = STRIPS["ideal_strip"](39.0, 6.0, 8.0, (0.2, 0.1), False)
-    widths = {fit: ellipse_width(mask, fit) for fit in ELLIPSE_FITS}
+    widths = {fit: STRIPS["ellipse_width"](mask, fit) for fit in STRIPS["ELLIPSE_FITS"]}
     assert widths["moments"] / 39.0 == pytest.approx(2.0 / np.sqrt(3.0), rel=0.005)
-    assert widths["pixels"] / 39.0 == pytest.approx(0.963, abs=0.01)
+    assert widths["pixels"] / 39.0 == pytest.approx(0.963, abs=0.01) and ellipse_width(mask) == widths["pixels"]
     assert 1.03 < widths["contour"] / 39.0 < 1.10
 
 

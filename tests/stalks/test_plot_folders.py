@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from odometry_of_plot import read_odometry
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, Patterns, PlotFolder, find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image
 from jaxrl_vis.stalks.phenotyping.io.naming.stamps import match_nearest, parse_timestamp
-from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read_odometry
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault
 
 
 def touch(folder: Path, *names: str) -> Path:

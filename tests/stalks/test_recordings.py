@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from odometry_of_plot import read_odometry
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io import recording
@@ -12,7 +13,6 @@ from jaxrl_vis.stalks.phenotyping.io.calibration import find_calibration, read_c
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import read_image
 from jaxrl_vis.stalks.phenotyping.io.recording import Topics, extract_recording, is_recording
-from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometry
 
 SIZE = (24, 32)
 FRAMES = 3

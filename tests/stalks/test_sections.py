@@ -338,4 +338,4 @@ def test_images_of_unknown_cameras_and_doubtful_ones_are_read_by_other_networks(
     boxes, others = ([detection.box for detection in found] for found in (detections, by_day(image, camera)))
     assert others and (boxes == others) == is_replaced
     if camera is not None:
-        assert detections.is_unfamiliar == is_flagged  # although other networks have read the image
+        assert (detections.doubt > detections.max_doubt) == is_flagged  # although other networks have read the image

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from odometry_of_plot import read_odometry
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, average_precision, match_detections, summarize_scores
 from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean_widths
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
-from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read_odometries, read_odometry
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read_odometries
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement
 from jaxrl_vis.stalks.phenotyping.track.direction import track_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track, track_stalks

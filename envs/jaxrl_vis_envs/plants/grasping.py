@@ -11,9 +11,6 @@ import dataclasses
 from jaxrl_vis_envs.plants.family import TRAINING, Family, Layout, Rig
 from jaxrl_vis_envs.plants.shifts import SHIFTS, shift
 
-MIN_RANGE = 0.4
-"""Minimum distance at which the pair measures depth, m."""
-
 _LENGTH = 1.6
 
 GRASPING = dataclasses.replace(

@@ -23,10 +23,8 @@ from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
 _BATCH, _BATCH_ON_ACCELERATOR = 8, 32  # stalk crops per batch
 _MIN_VISIBLE = 0.5  # minimum fraction of a stalk's axis outside black borders
 _MAX_ENLARGED = 3.0  # at more, a stalk is only three pixels wide and cannot be recognised
-# Fraction of the gate's maximum doubt above which the substitute reads an image: it reads images at night nearly as well, but
-# the networks for these hardly read any by day.
-_SUBSTITUTE_DOUBT = 0.5
-_COVERED = 0.15  # minimum fraction of the band that the sections of a stalk cover: leaves hide much of some stalks
+_SUBSTITUTE_DOUBT = 0.5  # fraction of the maximum doubt from which a substitute reads an image: at night it is hardly worse
+_COVERED = 0.3  # minimum fraction of the band that the sections of a stalk cover
 _MAX_STRETCH = 1.12  # range of stretching in training: the networks accept image heights within this factor
 
 
@@ -73,11 +71,6 @@ class Detections(list[Detection]):
     ) -> None:
         super().__init__(detections)
         self.doubt, self.max_doubt = doubt, max_doubt
-
-    @property
-    def is_unfamiliar(self) -> bool:
-        """True if the gate finds the image unfamiliar."""
-        return self.doubt is not None and self.max_doubt is not None and self.doubt > self.max_doubt
 
 
 UPPER_OFFSET = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
@@ -177,8 +170,7 @@ class Finder:
         settings: Settings stored with the weights.
         min_score: Minimum score of a detection; 0.4 balances misses against false detections.
         gate: Gate that estimates how likely each image is misread; None if there is none for these weights.
-        substitute: Detector for images of unknown cameras, and for those that the gate doubts half as much as unfamiliar ones;
-            None for this one.
+        substitute: Detector for images of unknown cameras and those that the gate doubts; None for this one.
 
     Attributes:
         dtype: Compute dtype of the convolutions.
@@ -261,7 +253,7 @@ class Finder:
         if self._substitute is not None and _is_doubtful(detections):
             return detections
         if settings.section and band is not None:
-            # In rows by day, a minimum of 0.6 gives the maximum F1 of chains; at night, one below 0.4 that of boxes.
+            # For rows by day, F1 of chains is highest from a score of 0.6; at night, that of boxes from one below 0.4.
             scores = 1.0 - np.sqrt(1.0 - scores)
         selected = scores >= self._min_score
         stalks, scores = stalks[selected], scores[selected]
@@ -312,14 +304,13 @@ class Finder:
 
 def _is_doubtful(detections: Detections) -> bool:
     """Return True if a substitute should read the image of ``detections``."""
-    doubt, limit = detections.doubt, detections.max_doubt
-    return doubt is not None and limit is not None and doubt > _SUBSTITUTE_DOUBT * limit
+    return (detections.doubt or 0.0) > _SUBSTITUTE_DOUBT * (detections.max_doubt or 1.0)
 
 
 def cut_to_band(chains: list[Chain], scale: tuple[float, float], band: Band | None) -> tuple[np.ndarray, np.ndarray]:
     """Return boxes and axes [N, 6] in the original image, and scores [N], of the parts of chains in the band.
 
-    Chains whose sections cover less than 0.15 of the band are left out.
+    Chains whose sections cover less than 0.3 of the band are left out.
 
     Args:
         chains: Chains in the resized image.

@@ -11,14 +11,9 @@ benchmarks/stalks/strip_widths.py. Coordinates are in pixels, with (0, 0) at the
 import dataclasses
 import functools
 import math
-from typing import Literal
 
 import cv2
 import numpy as np
-
-EllipseFit = Literal["pixels", "pixels_direct", "contour", "contour_direct", "contour_ams", "moments"]
-ELLIPSE_FITS: tuple[EllipseFit, ...] = ("pixels", "pixels_direct", "contour", "contour_direct", "contour_ams", "moments")
-"""Methods of fitting an ellipse to a blob. ``pixels``, least squares over all its pixels, is the method of the thesis."""
 
 _MIN_ROWS = 8
 _CONVERGED = 1e-3  # change of weights below which the robust fit has converged
@@ -287,12 +282,11 @@ def _fit_line(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, 
     return float(mean_y - slope * mean_x), float(slope)
 
 
-def ellipse_width(mask: np.ndarray, fit: EllipseFit = "pixels") -> float | None:
-    """Compute the width as in the thesis: the largest minor axis of the ellipses fitted to the blobs of the mask.
+def ellipse_width(mask: np.ndarray) -> float | None:
+    """Compute the width as in the thesis: the largest minor axis of ellipses fitted to the blobs of the mask by least squares.
 
     Args:
         mask: [H, W] bool, or float32 from 0 to 1.
-        fit: Method of fitting an ellipse; see `ELLIPSE_FITS`.
 
     Returns:
         Width in pixels; None if no blob of 20 pixels or more has a valid ellipse. Ellipses wider than a blob of that area and
@@ -305,23 +299,9 @@ def ellipse_width(mask: np.ndarray, fit: EllipseFit = "pixels") -> float | None:
         area = int(stats[label, cv2.CC_STAT_AREA])
         if area < 20:
             continue
-        width = _minor_axis((labels == label).astype(np.uint8), fit)
+        row, column = np.nonzero(labels == label)
+        width = float(min(cv2.fitEllipse(np.stack([column, row], axis=1).astype(np.float32))[1]))
         length = math.hypot(stats[label, cv2.CC_STAT_WIDTH], stats[label, cv2.CC_STAT_HEIGHT])
-        if width is not None and math.isfinite(width) and 1.0 < width < 3.0 * area / max(length / math.sqrt(2.0), 1.0):
+        if math.isfinite(width) and 1.0 < width < 3.0 * area / max(length / math.sqrt(2.0), 1.0):
             widths.append(width)
     return max(widths, default=None)
-
-
-def _minor_axis(blob: np.ndarray, fit: EllipseFit) -> float | None:
-    row, column = np.nonzero(blob)
-    pixels = np.stack([column, row], axis=1).astype(np.float32)
-    if fit == "moments":
-        return 4.0 * math.sqrt(max(float(np.linalg.eigvalsh(np.cov(pixels.T))[0]), 0.0))
-    if fit.startswith("contour"):
-        contours, _ = cv2.findContours(blob, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        pixels = max(contours, key=len).reshape(-1, 2).astype(np.float32)
-    if len(pixels) < 5:
-        return None
-    fitter = {"direct": cv2.fitEllipseDirect, "ams": cv2.fitEllipseAMS}.get(fit.partition("_")[2], cv2.fitEllipse)
-    (_, axes, _) = fitter(pixels)
-    return float(min(axes))

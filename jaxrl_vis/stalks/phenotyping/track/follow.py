@@ -22,7 +22,7 @@ _FORBIDDEN_COST = 1e3  # cost of an assignment outside the gates
 # Gates of the tracker, lengths in m.
 _ALONG = 0.018  # maximum distance along the row between a track and a sighting assigned to it
 _DEPTH = 0.05  # maximum difference of their depths
-_STALE = 3  # pairs since the last depth of a track behind the row after which stalks of the row claim its place first
+_STALE = 3  # pairs without a depth after which a track behind the row gets no sightings that the row claims
 _ROW_FIRST_COST = 2.0  # more than the cost of any assignment within the gates
 _MERGE = 0.015  # maximum distance along the row between two tracks of one stalk, which are merged
 _MERGE_ACROSS_DEPTHS = 0.005  # the same for tracks of different depth, with the rays of one evaluated at the depth of the other

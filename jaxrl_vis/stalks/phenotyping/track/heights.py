@@ -103,18 +103,7 @@ class _WidthMeasurement:
 
 
 def _widths_of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
-    known = [
-        _WidthMeasurement(
-            e.diameter_mm,
-            e.deviation_mm,
-            e.height_m,
-            e.confidence * _view_weight(e),
-            e.occluded,
-            _pixel_size(e.diameter_mm, e.width_px),
-        )
-        for e in sightings
-        if e.diameter_mm is not None and e.height_m is not None
-    ]
+    known = [_lower_measurement(e, e.height_m) for e in sightings if e.diameter_mm is not None and e.height_m is not None]
     above = [
         _WidthMeasurement(
             e.upper_mm,
@@ -122,7 +111,7 @@ def _widths_of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
             e.upper_height_m,
             e.upper_confidence * _view_weight(e),
             e.upper_occluded,
-            _pixel_size(e.upper_mm, None if e.upper_place is None else e.upper_place[2]),
+            e.upper_mm / e.upper_place[2] if e.upper_place and e.upper_place[2] else 0.0,
         )
         for e in sightings
         if e.upper_mm is not None and e.upper_height_m is not None
@@ -134,9 +123,12 @@ def _widths_of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
     return StalkWidths(lower, upper, own, True)
 
 
-def _pixel_size(mm: float, pixels: float | None) -> float:
-    """Return the size of a pixel, mm, at a stalk of this width in mm and pixels; 0 if unknown."""
-    return mm / pixels if pixels else 0.0
+def _lower_measurement(sighting: Sighting, height: float) -> _WidthMeasurement:
+    """Return the measurement around 12 inches of a sighting that has one, with its height in m."""
+    mm, weight = sighting.diameter_mm, sighting.confidence * _view_weight(sighting)
+    assert mm is not None
+    pixel = mm / sighting.width_px if sighting.width_px else 0.0
+    return _WidthMeasurement(mm, sighting.deviation_mm, height, weight, sighting.occluded, pixel)
 
 
 def _view_weight(sighting: Sighting) -> float:
@@ -160,27 +152,13 @@ def _width_at(height: float, values: list[_WidthMeasurement], taper: float) -> W
 
 def robust_width(sightings: list[Sighting]) -> Width | None:
     """Estimate the diameter of a stalk from sightings at any height; None if it was never measured."""
-    return _combine(
-        [
-            _WidthMeasurement(
-                e.diameter_mm,
-                e.deviation_mm,
-                0.0,
-                e.confidence * _view_weight(e),
-                e.occluded,
-                _pixel_size(e.diameter_mm, e.width_px),
-            )
-            for e in sightings
-            if e.diameter_mm is not None
-        ]
-    )
+    return _combine([_lower_measurement(sighting, 0.0) for sighting in sightings if sighting.diameter_mm is not None])
 
 
 def _combine(values: list[_WidthMeasurement]) -> Width | None:
     """Estimate a width as the weighted median of its measurements; None if there are none.
 
-    Measurements with an occluded edge are lower bounds: these count with their 0.85 quantile, so that the width minimises the
-    weighted sum of their quantile losses and of the absolute differences from the others.
+    Those with an occluded edge are lower bounds and count with their 0.85 quantile: the sum of quantile losses is minimised.
     """
     if not values:
         return None
@@ -202,13 +180,7 @@ def _combine(values: list[_WidthMeasurement]) -> Width | None:
 
 
 def _joint_quantile(values: np.ndarray, weights: np.ndarray, quantiles: np.ndarray) -> float:
-    """Return the minimiser of a weighted sum of quantile losses, interpolated between values as in a weighted median.
-
-    Args:
-        values: Values [N] float64.
-        weights: Weight [N] float64 of each value.
-        quantiles: Quantile [N] float64 that each value counts with, 0 to 1.
-    """
+    """Return the minimiser of weighted quantile losses, interpolated as a weighted median; arrays [N] float64."""
     order = np.argsort(values)
     below, above = (weights * (1.0 - quantiles))[order], (weights * quantiles)[order]
     # The slope of the loss halfway through the step at each value.

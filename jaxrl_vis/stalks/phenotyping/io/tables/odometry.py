@@ -72,10 +72,19 @@ def odometry_file(folder: Path) -> Path:
 
 
 def read_odometries(plots: Sequence[PlotFolder], speed: float | None) -> dict[str, dict[str, float] | None]:
-    """Read the odometry of each plot, by the plot's name, see `read_odometry`.
+    """Read the distances driven at the pairs of each plot, m, by the plot's and the pair's name.
+
+    Args:
+        plots: Plots, whose folders may hold ``odometry.csv`` or one of the alternatives, see `odometry_file`.
+        speed: Speed of the robot, m/s, for files that hold only times.
+
+    Returns:
+        Plot -> pair -> distance; pairs that no row matches are missing. None for a plot without a file, or with only times but
+        no speed, see `odometry_fault`.
 
     Raises:
-        RequestError: A file cannot be used, or a speed is given but none of the files needs it.
+        RequestError: A file cannot be read, states neither distances nor times, or has rows that cannot be matched with pairs;
+            or a speed is given but none of the files needs it.
     """
     tables = {plot.name: _read(odometry_file(plot.folder)) for plot in plots}
     if speed is not None and not any(table and table.distances is None for table in tables.values()):
@@ -83,28 +92,12 @@ def read_odometries(plots: Sequence[PlotFolder], speed: float | None) -> dict[st
     return {plot.name: _pair_distances(plot, tables[plot.name], speed) for plot in plots}
 
 
-def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, float] | None:
-    """Read the distance driven at each pair, by the pair's name, m; None if unknown, see `odometry_fault`.
-
-    Args:
-        plot: Plot, whose folder may hold ``odometry.csv`` or one of the alternatives, see `odometry_file`.
-        speed: Speed of the robot, m/s, for files that hold only times.
-
-    Returns:
-        Pair -> distance; pairs that no row matches are missing. None if there is no file, or only times but no speed.
-
-    Raises:
-        RequestError: The file cannot be read, states neither distances nor times, or its rows cannot be matched with the pairs.
-    """
-    return _pair_distances(plot, _read(odometry_file(plot.folder)), speed)
-
-
 def odometry_fault(plot: PlotFolder, distances: Mapping[str, float] | None, pairs: Sequence[PairFiles]) -> str | None:
     """Return a message that states why the distance driven is unknown; None if it is known.
 
     Args:
         plot: The plot.
-        distances: Its odometry, from `read_odometry`.
+        distances: Its odometry, from `read_odometries`.
         pairs: The pairs for which it must be known.
     """
     path = odometry_file(plot.folder)
