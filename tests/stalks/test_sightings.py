@@ -382,7 +382,7 @@ def test_a_stalk_that_is_partly_hidden_is_at_least_as_thick_as_it_looks():
     hidden = dict(occluded=True, confidence=0.08)
     occluded = [sighting(0.0, diameter_mm=each, **hidden) for each in (8.0, 10.0, 12.0, 13.0, 13.8, 14.0)]
     clear = [sighting(0.0, diameter_mm=14.0 + each) for each in (-0.1, 0.0, 0.1)]
-    assert robust_width([*occluded, *clear]).mm == pytest.approx(14.0, abs=0.03)  # pyright: ignore[reportOptionalMemberAccess]
+    assert robust_width([*occluded, *clear]).mm == pytest.approx(14.0, abs=0.01)  # pyright: ignore[reportOptionalMemberAccess]
     assert robust_width(occluded).mm == pytest.approx(13.7, abs=0.31)  # pyright: ignore[reportOptionalMemberAccess]
     above = [
         dataclasses.replace(
