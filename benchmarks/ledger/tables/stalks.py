@@ -57,27 +57,25 @@ def lens_rows(lenses: dict[str, Any]) -> str:
 
 
 def coverage_table(results: Path = RESULTS) -> str | None:
-    """Return a table of 95 % intervals from the records of `phenotype eval` for both families; None unless both exist."""
+    """Return a table of plots that no choice depended on, from the records of `phenotype eval`; None unless both exist."""
     lines = [
-        "| family | seeds | widths | coverage | mean absolute error, mm | mean standard error, mm |",
-        "|---|---|---|---|---|---|",
+        "| family | seeds | error of the count (bias, R²) | error of widths, mm (bias) | coverage of 95 % "
+        "| mean standard error, mm | F1 (precision, recall) |",
+        "|---|---|---|---|---|---|---|",
     ]
+    origins = set()
     for family in ("training", "shifted"):
         path = results / "phenotyping" / f"coverage_{family}.json"
         if not path.exists():
             return None
         record = read_json(path)
+        origins |= _origins(record)
         seeds = [plot["seed"] for plot in record["each"]]
-        errors = [error for plot in record["each"] for error in plot["width_errors_mm"]]
-        cells = (
-            f"{min(seeds)} to {max(seeds)}",
-            f"{record['widths']}",
-            f"{100 * record['width_coverage_95']:.0f} %",
-            f"{record['width_mae_mm']:.2f}",
-            f"{np.mean(errors):.2f}",
-        )
-        lines.append(f"| {family} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        standard_errors = [error for plot in record["each"] for error in plot["width_errors_mm"]]
+        count, width, coverage, f1 = _cells(record)
+        cells = (f"`{family}`", f"{min(seeds)} to {max(seeds)}", count, width, coverage, f"{np.mean(standard_errors):.2f}", f1)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join([*lines, "", origin_sentence([Record("coverage", (), frozenset(origins))])])
 
 
 def families_table(results: Path = RESULTS) -> str | None:
@@ -93,17 +91,24 @@ def families_table(results: Path = RESULTS) -> str | None:
         if not path.exists():
             continue
         record = read_json(path)
-        plots = record["each"]
-        origins |= {f"{(plot['revision'] or 'unknown')[:7]} on {plot['device'].removesuffix(' x1')}" for plot in plots}
-        cells = (
-            f"{record['plots']}",
-            f"{record['count_true'] / record['plots']:.1f}",
-            f"{record['count_mae']:.2f} ({100 * record['count_bias']:+.1f} %, {record['count_r2']:.3f})",
-            f"{record['width_mae_mm']:.2f} ({record['width_bias_mm']:+.2f})",
-            f"{100 * record['width_coverage_95']:.0f} %",
-            f"{record['f1']:.3f} ({record['precision']:.3f}, {record['recall']:.3f})",
-        )
-        lines.append(f"| {title} | " + " | ".join(cells) + " |")
+        origins |= _origins(record)
+        cells = (title, f"{record['plots']}", f"{record['count_true'] / record['plots']:.1f}", *_cells(record))
+        lines.append("| " + " | ".join(cells) + " |")
     if not origins:
         return None
     return "\n".join([*lines, "", origin_sentence([Record("families", (), frozenset(origins))])])
+
+
+def _cells(record: dict[str, Any]) -> tuple[str, str, str, str]:
+    """Return the cells for the counts, widths, coverage and detections of a record of `phenotype eval`."""
+    return (
+        f"{record['count_mae']:.2f} ({100 * record['count_bias']:+.1f} %, {record['count_r2']:.3f})",
+        f"{record['width_mae_mm']:.2f} ({record['width_bias_mm']:+.2f})",
+        f"{100 * record['width_coverage_95']:.0f} %",
+        f"{record['f1']:.3f} ({record['precision']:.3f}, {record['recall']:.3f})",
+    )
+
+
+def _origins(record: dict[str, Any]) -> set[str]:
+    """Return revision and device of each plot of a record."""
+    return {f"{(plot['revision'] or 'unknown')[:7]} on {plot['device'].removesuffix(' x1')}" for plot in record["each"]}
