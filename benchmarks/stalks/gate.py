@@ -21,7 +21,8 @@ import numpy as np
 from benchmarks.stalks.gate_fit import fit_gate, fit_logistic_regression, write_gate
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.host.worker_pool import evaluate_all, share_accelerator
-from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Finder, in_frame
+from jaxrl_vis.stalks.phenotyping.detector.band import Band, in_frame
+from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
 from jaxrl_vis.stalks.phenotyping.detector.gate import Gate, gate_path
 from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder
 from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, UNCLEAR

@@ -2,15 +2,18 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
+from jaxrl_vis.stalks.phenotyping.detector import finder as finder_module
+from jaxrl_vis.stalks.phenotyping.detector.band import Band
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect
 from jaxrl_vis.stalks.phenotyping.detector.finder import (
-    Band,
     Detection,
     _clear_border_rows,
     _is_inside_frame,
@@ -132,6 +135,27 @@ def test_widths_do_not_depend_on_crops_borders_and_lenses():
     assert len(through) == 8
     beside = [abs(through[place][0] - plain[place][0]) for place in set(clear) & through.keys() if through[place][1] > 0.4]
     assert len(beside) >= 3 and np.median(beside) < 0.1
+
+
+def test_boxes_above_the_band_are_moved_there(monkeypatch):
+    """The detector of one pair of the sample row places the band too high, as that of cameras that look down may do."""
+    left, right, camera = sample()
+    finder = load_finder(SHIPPED, 0.5)
+    usual = view_pair(finder, left, right, camera).detections
+
+    def too_high(*args: Any) -> Any:
+        detected = detect(*args)
+        left, top, right, bottom, above, below = jnp.moveaxis(detected.stalks, -1, 0)
+        aside = 60.0 * (below - above) / (bottom - top)
+        moved = (left - aside, top - 60.0, right - aside, bottom - 60.0, above - aside, below - aside)
+        return dataclasses.replace(detected, stalks=jnp.stack(moved, axis=-1))
+
+    monkeypatch.setattr(finder_module, "detect", too_high)
+    moved = view_pair(finder, left, right, camera).detections
+    assert len(moved) == len(usual) == 8
+    for before, after in zip(usual, moved):
+        assert after.box[1::2] == pytest.approx(before.box[1::2], abs=10)
+        assert after.axis == pytest.approx(before.axis, abs=1)
 
 
 def stalks_at(disparity: int, *others: int) -> tuple[np.ndarray, np.ndarray, list[Detection]]:

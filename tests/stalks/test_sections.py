@@ -10,11 +10,12 @@ from tiny_detector import TINY
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.anchors import encode, make_anchors
+from jaxrl_vis.stalks.phenotyping.detector.band import cut_to_band, move_to_band
 from jaxrl_vis.stalks.phenotyping.detector.boxes import roi_align, strip_half_width
 from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, covered_fraction, cut_chain, link
 from jaxrl_vis.stalks.phenotyping.detector.detect import GRID, Settings, detect, init_detector, pool_regions
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
-from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, cut_to_band
+from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
 from jaxrl_vis.stalks.phenotyping.detector.gate import read_gate
 from jaxrl_vis.stalks.phenotyping.detector.loading import load_finder
 from jaxrl_vis.stalks.phenotyping.detector.sections import (
@@ -233,6 +234,14 @@ def test_the_band_is_where_the_ground_says():
     assert scores == pytest.approx([chain.score])
     assert not len(cut_to_band([chain], (2.0, 2.0), lambda column: (800.0, 1000.0))[1])
     assert len(cut_to_band([chain], (2.0, 2.0), None)[0]) == 1
+
+
+def test_boxes_far_from_the_band_move_there_along_their_axes():
+    inside = [88.0, 100.0, 122.0, 200.0, 100.0, 110.0]
+    above = [88.0, 60.0, 122.0, 160.0, 100.0, 110.0]
+    moved = move_to_band(np.array([inside, above], np.float32), lambda column: (99.5, 199.5) if column == 104.5 else (0.0, 0.0))
+    np.testing.assert_array_equal(moved[0], inside)
+    np.testing.assert_allclose(moved[1], [92, 100, 126, 200, 104, 114], atol=1e-4)
 
 
 # --- synthetic stalks, networks and weights ---

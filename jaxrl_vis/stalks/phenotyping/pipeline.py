@@ -24,7 +24,8 @@ import jaxrl_vis
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.worker_pool import UnorderedMap, worker_pool
 from jaxrl_vis.stalks.digests import value_digest
-from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection, Detections
+from jaxrl_vis.stalks.phenotyping.detector.band import Band
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, Detections
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any, Self
 
 import cv2
@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, covered_fraction, cut_chain, link
+from jaxrl_vis.stalks.phenotyping.detector.band import Band, cut_to_band, in_frame, move_to_band, to_image_coordinates
+from jaxrl_vis.stalks.phenotyping.detector.chains import link
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, pad_image
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.doubles import suppress_duplicates
@@ -24,13 +25,7 @@ _BATCH, _BATCH_ON_ACCELERATOR = 8, 32  # stalk crops per batch
 _MIN_VISIBLE = 0.5  # minimum fraction of a stalk's axis outside black borders
 _MAX_ENLARGED = 3.0  # at more, a stalk is only three pixels wide and cannot be recognised
 _SUBSTITUTE_DOUBT = 0.5  # fraction of the maximum doubt from which a substitute reads an image: at night it is hardly worse
-_COVERED = 0.3  # minimum fraction of the band that the sections of a stalk cover
 _MAX_STRETCH = 1.12  # range of stretching in training: the networks accept image heights within this factor
-
-
-Band = Callable[[float], tuple[float, float]]
-"""Function that returns the first and last row of the band in a column of an image, pixels; (0, 0) is the centre of the first
-pixel. Networks that detect sections need it to cut stalks to the band; others recognise the band by themselves."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,11 +138,6 @@ def pad_to_training_height(image: np.ndarray, settings: Settings) -> tuple[np.nd
     return np.pad(image, ((above, beyond - above), (0, 0), (0, 0))), above
 
 
-def to_image_coordinates(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
-    """Convert stalks [N, 6] from coordinates of the resized image to those of the original; ``scale`` as from `resize`."""
-    return stalks * np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
-
-
 @functools.partial(jax.jit, static_argnums=(2, 3, 4))
 def segment(params: Any, crops: jax.Array, settings: Settings, dtype: Any, full_shape: tuple[int, int]) -> jax.Array:
     """Compute probabilities [N, h, w] float32 that pixels of stalk crops [N, h, w, 3] uint8 show the stalk in the centre.
@@ -220,7 +210,7 @@ class Finder:
         Args:
             image: [h, w, 3] uint8, without black borders.
             pixels_per_metre: Resolution of the image at the row of plants; None if the camera is unknown.
-            band: Rows of the band in this image; None if the camera is unknown. Only used with sections.
+            band: Rows of the band in this image; None if the camera is unknown.
 
         Returns:
             Boxes and axes [N, 6] of all detections down to `Settings.min_score` (with sections, of all chains in the band, see
@@ -237,7 +227,10 @@ class Finder:
             chains = link(detected.stalks[detected.valid], detected.scores[detected.valid], settings.section)
             return *cut_to_band(chains, scale, band), np.asarray(detected.pooled)
         moved = detected.stalks[detected.valid] - np.array([0, added, 0, added, 0, 0], np.float32)
-        return to_image_coordinates(moved, scale), detected.scores[detected.valid], np.asarray(detected.pooled)
+        stalks = to_image_coordinates(moved, scale)
+        if band is not None:
+            stalks = move_to_band(stalks, band)
+        return stalks, detected.scores[detected.valid], np.asarray(detected.pooled)
 
     def _find(self, image: np.ndarray, pixels_per_metre: float | None, frame: Frame, band: Band | None) -> Detections:
         """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame, in its coordinates.
@@ -305,40 +298,6 @@ class Finder:
 def _is_doubtful(detections: Detections) -> bool:
     """Return True if a substitute should read the image of ``detections``."""
     return (detections.doubt or 0.0) > _SUBSTITUTE_DOUBT * (detections.max_doubt or 1.0)
-
-
-def cut_to_band(chains: list[Chain], scale: tuple[float, float], band: Band | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return boxes and axes [N, 6] in the original image, and scores [N], of the parts of chains in the band.
-
-    Chains whose sections cover less than 0.3 of the band are left out.
-
-    Args:
-        chains: Chains in the resized image.
-        scale: Vertical and horizontal factors from coordinates of the resized image to those of the original.
-        band: Rows of the band in the original image; None for the part of each chain with the highest scores, see `best_rows`.
-    """
-    stalks, scores = [], []
-    for chain in chains:
-        rows = best_rows(chain)
-        if band is not None:
-            column = float(np.median(chain.sections[:, 4:])) * scale[1] - 0.5
-            top, bottom = band(column)
-            rows = (top + 0.5) / scale[0], (bottom + 0.5) / scale[0]
-        if rows[1] - rows[0] > 1.0 and covered_fraction(chain, *rows) >= _COVERED:
-            stalks.append(cut_chain(chain, *rows))
-            scores.append(chain.score)
-    return to_image_coordinates(np.array(stalks, np.float32).reshape(-1, 6), scale), np.array(scores, np.float32)
-
-
-def in_frame(band: Band, frame: Frame) -> Band:
-    """Convert the rows of the band from coordinates of the whole image to those of a frame."""
-    down, over = frame.rows[0], frame.columns[0]
-
-    def inside(column: float) -> tuple[float, float]:
-        top, bottom = band(column + over)
-        return top - down, bottom - down
-
-    return inside
 
 
 def _is_inside_frame(stalk: np.ndarray, frame: Frame) -> bool:

@@ -8,7 +8,8 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.digests import file_digest
-from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection, Finder
+from jaxrl_vis.stalks.phenotyping.detector.band import Band
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, Finder
 from jaxrl_vis.stalks.phenotyping.detector.gate import read_gate
 from jaxrl_vis.stalks.phenotyping.detector.weights import PHOTOGRAPHS, SHIPPED, read_weights
 

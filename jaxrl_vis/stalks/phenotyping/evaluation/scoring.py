@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection
+from jaxrl_vis.stalks.phenotyping.detector.band import Band
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.evaluation.perfect import perfect_detections
 from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean_widths, measure_pair_as_thesis
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection
+from jaxrl_vis.stalks.phenotyping.detector.band import Band
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.evaluation.perfect import perfect_detections
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from jaxrl_vis.config import fields
-from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection
+from jaxrl_vis.stalks.phenotyping.detector.band import Band
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.measure.behind import depths_behind
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_rows, find_ground
