@@ -19,7 +19,7 @@ from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement
 from jaxrl_vis.stalks.phenotyping.track.direction import track_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track, track_stalks
-from jaxrl_vis.stalks.phenotyping.track.heights import USUAL_TAPER, robust_width, stalk_widths
+from jaxrl_vis.stalks.phenotyping.track.heights import USUAL_TAPER, StalkWidths, robust_width, stalk_widths
 from jaxrl_vis.stalks.phenotyping.track.near_row import near_row_depth
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, _occluded_edges
 from jaxrl_vis_envs.plants import Calibration
@@ -376,6 +376,23 @@ def test_an_edge_that_another_stalk_hides_is_not_its_own():
     # Of two that stand equally far away, either may hide the other's edge.
     assert _occluded_edges([found[0], dataclasses.replace(found[1], depth=0.799)]) == [True, True]
     assert _occluded_edges([found[0], dataclasses.replace(found[1], depth=0.83)]) == [False, True]
+
+
+def test_a_sliver_of_a_stalk_is_not_its_width():
+    """Of stalks with an occluded edge in all pairs, those that fit the plot keep their width; others are expected to fit it."""
+
+    def widths(*bounds: float, clear: int = 6) -> list[StalkWidths]:
+        hidden = dict(height_m=12 * 0.0254, occluded=True, confidence=0.08)
+        stalks = [[sighting(0.0, diameter_mm=18.0 + stalk, height_m=12 * 0.0254)] * 3 for stalk in range(clear)]
+        stalks += [[sighting(0.0, diameter_mm=bound, **hidden)] * 3 for bound in bounds]
+        tracks = [Track(tuple((stalk, place) for place in range(3)), 0.0, 0.8, True, "") for stalk in range(len(stalks))]
+        return stalk_widths(stalks, tracks)[clear:]
+
+    sliver, whole, thick = (width.lower for width in widths(4.0, 20.0, 45.0))
+    assert sliver.mm == pytest.approx(20.5, abs=0.2) and 1.5 < sliver.error < 3.0  # pyright: ignore[reportOptionalMemberAccess]
+    assert 20.0 < whole.mm < 20.5 and thick.mm == 45.0  # pyright: ignore[reportOptionalMemberAccess]
+    # Too few clear stalks say what is usual in the plot.
+    assert widths(4.0, clear=4)[0].lower.mm == 4.0  # pyright: ignore[reportOptionalMemberAccess]
 
 
 def test_a_stalk_that_is_partly_hidden_is_at_least_as_thick_as_it_looks():

@@ -2,10 +2,14 @@
 
 A stalk is measured as near to a height as its edges are visible. Widths measured at another height are corrected by the taper,
 the decrease in width per inch: the median over stalks of the same plot that were measured at both heights.
+
+A stalk with an occluded edge in all pairs has only a lower bound, often of a sliver beside another stalk. Its width is the mean
+of the posterior distribution, whose prior are the clear widths of the plot.
 """
 
 import dataclasses
 import math
+from statistics import NormalDist
 
 import numpy as np
 
@@ -24,6 +28,11 @@ _OCCLUDED_WEIGHT = 4.0  # factor of their weights: their confidence, a tenth of 
 # Errors common to all pairs, which their scatter does not show; estimated on synthetic stalks.
 _MASK_ERROR = 0.7  # pixels: bias of masks on one texture
 _OCCLUSION_ERROR = 1.5  # mm, if an edge may be occluded in all pairs
+# Lower bounds: chosen on synthetic plots of the training family with one factor shifted.
+_CLEAR, _BOUND = 0.5, 0.9  # shares of occluded measurements below which a width is clear, and above which it is a lower bound
+_MIN_CLEAR = 5  # stalks with clear widths that a prior needs
+_MIN_SPREAD = 0.1  # relative: minimum standard deviation of the widths of a plot
+_TIGHT, _TIGHT_ERROR = 0.95, 0.5  # prior probability that a bound is the width itself, and its standard error then, mm
 _CALIBRATION_ERROR = 0.005  # relative: focal length and baseline of a good calibration
 _FEW = 2.0  # pairs: correction for the underestimated scatter of few pairs
 _MAX_OFFSET = 4.0 * INCH  # m: maximum distance of a measurement from a height
@@ -36,11 +45,13 @@ class Width:
     """Diameter of a stalk, estimated from all its sightings.
 
     Attributes:
-        mm: Weighted median of the diameters, mm; those with an occluded edge count as lower bounds.
+        mm: Weighted median of the diameters, mm; those with an occluded edge count as lower bounds. If all are occluded, the
+            expected width, given their bound and the other widths of the plot.
         error: Standard error, mm: from the scatter between pairs, the common bias of masks, occluded edges, and a good
             calibration. Intervals of +/- 2 standard errors cover about 95 % of synthetic stalks.
         scatter: Standard error from the scatter between pairs alone, mm, at least that from the errors of edges and disparity.
         count: Number of sightings that were used.
+        occluded: Share of sightings with an occluded edge in the sum of weights, 0 to 1.
         corrected: True if most of them were measured at another height and corrected by the taper.
     """
 
@@ -48,6 +59,7 @@ class Width:
     error: float
     scatter: float
     count: int
+    occluded: float
     corrected: bool = False
 
 
@@ -58,14 +70,19 @@ class StalkWidths:
     Attributes:
         lower: Width at 12 inches, or wherever it was measured if ``height_known`` is False; None if not measured.
         upper: Width at 24 inches; None if not measured.
-        taper: Decrease in width between both heights, mm per inch; None unless both were measured.
         height_known: True if ``lower`` is a width at 12 inches, which requires a pair that shows both the stalk and the ground.
     """
 
     lower: Width | None
     upper: Width | None
-    taper: float | None
     height_known: bool
+
+    @property
+    def taper(self) -> float | None:
+        """Decrease in width between both heights, mm per inch; None unless both were measured."""
+        if self.lower is None or self.upper is None or not self.height_known:
+            return None
+        return (self.lower.mm - self.upper.mm) / ((UPPER - LOWER) / INCH)
 
 
 def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWidths]:
@@ -79,7 +96,9 @@ def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[Stal
     first = [_widths_of_stalk(sightings, USUAL_TAPER) for sightings in of_stalks]
     tapers = [width.taper for width in first if width.taper is not None]
     taper = float(np.median(tapers)) if len(tapers) >= _MIN_SIGHTINGS else USUAL_TAPER
-    return [_widths_of_stalk(sightings, taper) for sightings in of_stalks]
+    measured = [_widths_of_stalk(sightings, taper) for sightings in of_stalks]
+    lower, upper = (_replace_bounds(widths) for widths in ([w.lower for w in measured], [w.upper for w in measured]))
+    return [dataclasses.replace(w, lower=low, upper=high) for w, low, high in zip(measured, lower, upper)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,10 +136,7 @@ def _widths_of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
         if e.upper_mm is not None and e.upper_height_m is not None
     ]
     lower, upper = _width_at(LOWER, known, taper), _width_at(UPPER, above, taper)
-    if lower is None:
-        return StalkWidths(robust_width(sightings), upper, None, False)
-    own = None if upper is None else (lower.mm - upper.mm) / ((UPPER - LOWER) / INCH)
-    return StalkWidths(lower, upper, own, True)
+    return StalkWidths(robust_width(sightings), upper, False) if lower is None else StalkWidths(lower, upper, True)
 
 
 def _lower_measurement(sighting: Sighting, height: float) -> _WidthMeasurement:
@@ -129,6 +145,37 @@ def _lower_measurement(sighting: Sighting, height: float) -> _WidthMeasurement:
     assert mm is not None
     pixel = mm / sighting.width_px if sighting.width_px else 0.0
     return _WidthMeasurement(mm, sighting.deviation_mm, height, weight, sighting.occluded, pixel)
+
+
+def _replace_bounds(widths: list[Width | None]) -> list[Width | None]:
+    """Replace lower bounds by the widths that are expected from them and from the clear widths of the same plot."""
+    clear = np.array([width.mm for width in widths if width is not None and width.occluded < _CLEAR])
+    if len(clear) < _MIN_CLEAR:
+        return widths
+    middle = float(np.median(clear))
+    prior = NormalDist(middle, max(1.4826 * float(np.median(np.abs(clear - middle))), _MIN_SPREAD * middle))
+    return [width if width is None or width.occluded <= _BOUND else _expected_width(width, prior) for width in widths]
+
+
+def _expected_width(bound: Width, prior: NormalDist) -> Width:
+    """Return the posterior mean of a width and its standard error, from a lower bound.
+
+    The bound is either the width itself or that of a part of the stalk, uniform up to the width. In the second case, the
+    posterior is nearly the prior truncated at the bound.
+    """
+    beyond = prior.zscore(bound.mm)
+    tail = NormalDist().cdf(-beyond)
+    if tail < 1e-6:
+        return bound
+    ratio = NormalDist().pdf(beyond) / tail
+    mean = prior.mean + prior.stdev * ratio
+    variance = prior.variance * (1.0 + beyond * ratio - ratio**2)
+    whole = _TIGHT * NormalDist(prior.mean, math.hypot(prior.stdev, _TIGHT_ERROR)).pdf(bound.mm)
+    part = (1.0 - _TIGHT) * tail / mean
+    share = part / (whole + part)
+    mm = bound.mm + share * (mean - bound.mm)
+    error = (1.0 - share) * (bound.error**2 + (bound.mm - mm) ** 2) + share * (variance + (mean - mm) ** 2)
+    return dataclasses.replace(bound, mm=mm, error=math.sqrt(error))
 
 
 def _view_weight(sighting: Sighting) -> float:
@@ -167,16 +214,17 @@ def _combine(values: list[_WidthMeasurement]) -> Width | None:
     weights = np.maximum(weights, 0.02) * np.where(occluded, _OCCLUDED_WEIGHT, 1.0)
     middle = _joint_quantile(widths, weights, np.where(occluded, _OCCLUDED_QUANTILE, 0.5))
     enough = float(weights.sum() ** 2 / (weights**2).sum())
+    share = float(weights[occluded].sum() / weights.sum())
     scatter = 1.4826 * float(np.median(np.abs(widths - middle))) * 1.2533 if len(widths) > 2 else 0.0
     mean_error = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
     of_pairs = max(scatter, mean_error) / math.sqrt(enough)
     error = math.hypot(
         of_pairs * math.sqrt(1.0 + _FEW / len(widths)),
         _MASK_ERROR * float(np.median([value.pixel for value in values])),
-        _OCCLUSION_ERROR * float(weights[occluded].sum() / weights.sum()),
+        _OCCLUSION_ERROR * share,
         _CALIBRATION_ERROR * middle,
     )
-    return Width(middle, error, of_pairs, len(widths))
+    return Width(middle, error, of_pairs, len(widths), share)
 
 
 def _joint_quantile(values: np.ndarray, weights: np.ndarray, quantiles: np.ndarray) -> float:
