@@ -58,8 +58,9 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/lab/renderer_parity.md": {"table": renderer_parity},
     "docs/phenotyping.md": {
         "lenses": stalks.lens_table,
-        "coverage": stalks.coverage_table,
         "families": stalks.families_table,
+        "fresh": stalks.fresh_table,
+        "thesis": stalks.thesis_table,
     },
     "docs/export.md": {"policies": exported.exported_table},
     "docs/algorithms.md": {"forms": contrastive.forms_table},

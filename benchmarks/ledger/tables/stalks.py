@@ -18,7 +18,12 @@ FAMILIES = {
     "thin_wet": "`thin_wet`: thin, crowded, wet sorghum at night",
     "maize_by_day": "`maize_by_day`: green maize, rows behind",
 }
-"""Description by name of the family, and of its record in ``phenotyping/families``."""
+FRESH_FAMILIES = {
+    "thick_dry": "`thick_dry`: thick, sparse, dry stalks and more leaves at night",
+    "other_rig": "`other_rig`: at night, cameras that are closer and look down, with a longer baseline",
+    "sorghum_by_day": "`sorghum_by_day`: dense green rows, rows behind",
+}
+"""Descriptions by name of the family, and of its record in ``phenotyping/families`` or ``phenotyping/fresh``."""
 
 
 def lens_table(results: Path = RESULTS) -> str | None:
@@ -56,57 +61,86 @@ def lens_rows(lenses: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def coverage_table(results: Path = RESULTS) -> str | None:
-    """Return a table of plots that no choice depended on, from the records of `phenotype eval`; None unless both exist."""
-    lines = [
-        "| family | seeds | error of the count (bias, R²) | error of widths, mm (bias) | coverage of 95 % "
-        "| mean standard error, mm | F1 (precision, recall) |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    origins = set()
-    for family in ("training", "shifted"):
-        path = results / "phenotyping" / f"coverage_{family}.json"
-        if not path.exists():
-            return None
-        record = read_json(path)
-        origins |= _origins(record)
-        seeds = [plot["seed"] for plot in record["each"]]
-        standard_errors = [error for plot in record["each"] for error in plot["width_errors_mm"]]
-        count, width, coverage, f1 = _cells(record)
-        cells = (f"`{family}`", f"{min(seeds)} to {max(seeds)}", count, width, coverage, f"{np.mean(standard_errors):.2f}", f1)
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", origin_sentence([Record("coverage", (), frozenset(origins))])])
-
-
 def families_table(results: Path = RESULTS) -> str | None:
-    """Return a table of the records of `phenotype eval` for several families; None without records."""
+    """Return a table of the families on which rules were chosen; None without records."""
+    return _table_of_families(results / "phenotyping" / "families", FAMILIES)
+
+
+def fresh_table(results: Path = RESULTS) -> str | None:
+    """Return a table of plots and families that no choice depended on; None without records."""
+    return _table_of_families(results / "phenotyping" / "fresh", FAMILIES | FRESH_FAMILIES)
+
+
+def _table_of_families(folder: Path, titles: dict[str, str]) -> str | None:
+    """Return a table of the records of `phenotype eval` in a folder, in the order of ``titles``; None without records."""
     lines = [
         "| family | plots | stalks per plot | error of the count (bias, R²) | error of widths, mm (bias) | coverage of 95 % "
         "| F1 (precision, recall) |",
         "|---|---|---|---|---|---|---|",
     ]
     origins = set()
-    for family, title in FAMILIES.items():
-        path = results / "phenotyping" / "families" / f"{family}.json"
+    for family, title in titles.items():
+        path = folder / f"{family}.json"
         if not path.exists():
             continue
         record = read_json(path)
         origins |= _origins(record)
-        cells = (title, f"{record['plots']}", f"{record['count_true'] / record['plots']:.1f}", *_cells(record))
+        cells = (
+            title,
+            f"{record['plots']}",
+            f"{record['count_true'] / record['plots']:.1f}",
+            _count_cell(record),
+            _width_cell(record),
+            f"{100 * record['width_coverage_95']:.0f} %",
+            _f1_cell(record),
+        )
         lines.append("| " + " | ".join(cells) + " |")
     if not origins:
         return None
     return "\n".join([*lines, "", origin_sentence([Record("families", (), frozenset(origins))])])
 
 
-def _cells(record: dict[str, Any]) -> tuple[str, str, str, str]:
-    """Return the cells for the counts, widths, coverage and detections of a record of `phenotype eval`."""
-    return (
-        f"{record['count_mae']:.2f} ({100 * record['count_bias']:+.1f} %, {record['count_r2']:.3f})",
-        f"{record['width_mae_mm']:.2f} ({record['width_bias_mm']:+.2f})",
-        f"{100 * record['width_coverage_95']:.0f} %",
-        f"{record['f1']:.3f} ({record['precision']:.3f}, {record['recall']:.3f})",
+def thesis_table(results: Path = RESULTS) -> str | None:
+    """Return a table of the shifted family, and of the thesis's methods on the same detections; None without records."""
+    paths = results / "phenotyping" / "families" / "shifted.json", results / "phenotyping" / "thesis.json"
+    if not all(path.exists() for path in paths):
+        return None
+    many, some = map(read_json, paths)
+    lines = [
+        f"| | {many['plots']} plots | {some['plots']} of them | the thesis's methods, same detections |",
+        "|---|---|---|---|",
+    ]
+    rows = (
+        ("stalks counted, mean absolute error (bias, R²)", _count_cell(many), _count_cell(some), _count_cell(some, "thesis_")),
+        ("width at 12 inches, mm", _width_cell(many), _width_cell(some), _width_cell(some, "thesis_width")),
+        (
+            "the same compared with two people with calipers, like the thesis's scatter",
+            *(f"{record['width_mae_two_people_mm']:.2f}" for record in (many, some)),
+            "",
+        ),
+        ("width at 24 inches, mm", _width_cell(many, "width_24in"), _width_cell(some, "width_24in"), ""),
+        ("detections: AP at IoU 0.5", f"{many['ap50']:.3f}", f"{some['ap50']:.3f}", ""),
+        ("detections: F1 (precision, recall)", _f1_cell(many), _f1_cell(some), ""),
     )
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    origins = frozenset(_origins(many) | _origins(some))
+    return "\n".join([*lines, "", origin_sentence([Record("thesis", (), origins)])])
+
+
+def _count_cell(record: dict[str, Any], prefix: str = "") -> str:
+    """Return mean absolute error, bias and R² of the counts of a record of `phenotype eval`."""
+    mae, bias, r2 = (record[f"{prefix}count_{name}"] for name in ("mae", "bias", "r2"))
+    return f"{mae:.2f} ({100 * bias:+.1f} %, {r2:.3f})"
+
+
+def _width_cell(record: dict[str, Any], which: str = "width") -> str:
+    """Return mean absolute error and bias of the widths of a record, mm."""
+    return f"{record[f'{which}_mae_mm']:.2f} ({record[f'{which}_bias_mm']:+.2f})"
+
+
+def _f1_cell(record: dict[str, Any]) -> str:
+    """Return F1, precision and recall of the detections of a record."""
+    return f"{record['f1']:.3f} ({record['precision']:.3f}, {record['recall']:.3f})"
 
 
 def _origins(record: dict[str, Any]) -> set[str]:
