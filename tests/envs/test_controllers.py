@@ -20,8 +20,6 @@ def test_every_task_has_a_controller():
     assert sorted([*controllers.POLICIES, "FingerTurn"]) == sorted(EPISODES)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "FetchReach" else pytest.mark.slow) for name in EPISODES]
-)
+@pytest.mark.parametrize("name", EPISODES)
 def test_a_controller_on_the_true_state_succeeds(name):
     assert controllers.success_rate(name, EPISODES[name], seed=1) >= controllers.MIN_SUCCESS

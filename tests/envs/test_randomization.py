@@ -286,7 +286,6 @@ def test_training_command_randomizes() -> None:
             make_env(preset("debug", **({"env": "VisualReacher"} | wrong)))
 
 
-@pytest.mark.slow
 def test_a_learner_trains_in_environments_that_vary() -> None:
     """Every episode starts at the same place with a different appearance; learning continues, reproducibly bit for bit."""
     settings = {"num_envs": 4, "replay_transitions": 40, "updates_per_iteration": 2, "batch_size": 16, "eval_episodes": 2}

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-SLOW = ("02_new_environment", "05_phenotyping", "07_weighting")
+SLOW = ("07_weighting",)
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
 
 # Figures, and videos of a whole run as a page shows them wherever the notebook is read.

@@ -149,7 +149,6 @@ def test_clouds_that_do_not_stitch_and_an_arm_that_reaches_nothing_are_reported(
     assert row["flag"] == "no stalk is within reach" and row["reachable"] == "0" and int(row["grasp_points"]) > 2
 
 
-@pytest.mark.slow
 def test_eval_of_rows_and_of_an_empty_one(spec, tmp_path, capsys):
     out = tmp_path / "eval.json"
     words = ["grasp", "eval", "--masks", "truth", *WIDTH, "--runs", "2", "--reach"]
@@ -190,7 +189,6 @@ def test_eval_of_rows_and_of_an_empty_one(spec, tmp_path, capsys):
     assert "no stalk was found" in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_masks_are_compared_with_the_truth_and_the_figure_is_drawn(spec, tmp_path):
     family = dataclasses.replace(read(spec, GRASPING_FAMILIES))
     family = dataclasses.replace(family.at_width(256), rig=dataclasses.replace(family.at_width(256).rig, frames=3))
