@@ -3,7 +3,6 @@
 import json
 import math
 import reprlib
-import sys
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -58,7 +57,8 @@ def write_parameters(
             arrays |= _quantize(name, array)
         else:
             arrays[name] = array.astype(np.float32 if bits == 32 or name in exact else np.float16)
-    _write(path, arrays, about)
+    whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}  # scalars stay 0-dimensional
+    write_atomically(path, save(whole, {_ABOUT: json.dumps(dict(about))}))
 
 
 def _quantize(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
@@ -79,12 +79,6 @@ def _restore(high: np.ndarray, low: np.ndarray, scale: np.ndarray) -> np.ndarray
     """
     lower = ((low[:, None] >> _BIT_SHIFTS) & 3).ravel()[: high.size].reshape(high.shape)
     return (4 * high.astype(np.float32) + lower.astype(np.float32)) * scale
-
-
-def _write(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
-    """Write named arrays without conversion."""
-    whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}  # scalars stay 0-dimensional
-    write_atomically(path, save(whole, {_ABOUT: json.dumps(dict(about))}))
 
 
 def _flatten(params: Any) -> dict[str, Any]:
@@ -111,11 +105,6 @@ def read_parameters(
         RequestError: The file is missing, or holds no parameters, those of another network, or numbers that are not finite.
     """
     try:
-        if path.suffix.lower() == ".npz" and path.is_file():
-            raise RequestError(
-                f"{path} was written by an earlier version: convert it with `python -m jaxrl_vis.host.weights_file {path} "
-                f"{path.with_suffix(SUFFIX)}`, and pass the result"
-            )
         about = read_about(path, command)
         with safetensors.safe_open(path, framework="numpy") as file:
             settings, shapes = declare(about)
@@ -210,25 +199,3 @@ def check_range(path: Path, name: str, values: tuple[float, ...], low: float, hi
 
 def _other_network(path: Path, reason: str, command: str) -> str:
     return f"{path} holds weights of another network ({reason}): train them again with `{command}`"
-
-
-def convert(old: Path, new: Path) -> None:
-    """Convert a .npz file of an earlier version to the current format, bit for bit.
-
-    Raises:
-        OSError: A file cannot be read or written.
-        ValueError: The file holds no weights.
-    """
-    with np.load(old, allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
-    about = json.loads(arrays.pop(_ABOUT).tobytes())
-    if {array.dtype for array in arrays.values()} - {np.dtype(kind) for kind in _KINDS.values()}:
-        raise ValueError("weights have 16 or 32 bits")
-    _write(new, arrays, about)
-
-
-if __name__ == "__main__":
-    try:
-        convert(*map(Path, sys.argv[1:]))
-    except Exception as error:  # the old file may contain anything
-        sys.exit(f"cannot convert {' '.join(sys.argv[1:])}: {' '.join(str(error).split())}")

@@ -229,7 +229,7 @@ def test_kept_flow_is_that_of_the_images():
     (flow,) = episodes.stored.values()
     assert flow.shape == (EPISODES, HORIZON, 16, 16) and flow.dtype == jnp.uint8
     images = episodes.observations
-    wanted = jax.jit(optical_flow.flow_strength)(images[1, 2][None], images[1, 3][None])[0]
+    wanted = jax.jit(optical_flow.flow_strength)(images[1, 2:4])[0]
     np.testing.assert_allclose(optical_flow.from_bytes(flow[1, 2]), np.clip(wanted, 0.0, 255 / 16), atol=1 / 32 + 1e-4)
     assert wanted.max() > 0.5
     _, _, _, batch = learner(aux_tasks=("optical_flow",), weighting="sum")

@@ -83,12 +83,9 @@ def test_the_strength_of_flow_is_that_of_the_newest_colours_that_move():
         disc = 255 * np.exp(-(np.square(columns - column) + np.square(rows - 12)) / 8)
         return np.concatenate([np.tile(disc, (3, 1, 1)), rng.uniform(0, 255, (5, SIZE, SIZE))]).astype(np.uint8)
 
-    images_t = jnp.stack([frame(8), frame(8)])
-    images_tp1 = jnp.stack([frame(10), frame(8)])
+    images = jnp.stack([frame(8), frame(10), frame(10)])
     strength = jax.jit(optical_flow.flow_strength, static_argnames=("frame_stack", "stretch"))
-    pixels, stretched = (
-        np.asarray(strength(images_t, images_tp1, frame_stack=2, stretch=stretch)) for stretch in (False, True)
-    )
+    pixels, stretched = (np.asarray(strength(images, frame_stack=2, stretch=stretch)) for stretch in (False, True))
     assert pixels.shape == (2, SIZE, SIZE) and pixels.dtype == np.float32
     assert 1.5 < pixels[0, 12, 8] < 2.5
     assert pixels[1].max() < 1e-3 and np.all(np.isfinite(stretched))

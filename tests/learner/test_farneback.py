@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.ndimage
@@ -11,7 +12,12 @@ from jaxrl_vis.learner.auxtasks import farneback
 
 REFERENCES = Path(__file__).parents[1] / "data" / "optical_flow.npz"
 TASKS = ("VisualFetchReach", "VisualHandReach", "VisualFingerTurn")
-flow = jax.jit(farneback.flow)
+
+
+@jax.jit
+def flow(images_t, images_tp1):
+    """Return the flow [B, H, W, 2] between pairs of images [B, H, W]."""
+    return jax.vmap(farneback.flow)(jnp.stack([images_t, images_tp1], axis=1))[:, 0]
 
 
 def quantiles(found, expected):

@@ -4,8 +4,6 @@ import csv
 import json
 import os
 import struct
-import subprocess
-import sys
 import zlib
 from collections.abc import Iterator
 
@@ -23,7 +21,6 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import weights_file
 from jaxrl_vis.host.spreadsheets import escape_cell, to_csv, unescape_cell
 from jaxrl_vis.stalks.grasping.masks import painter
-from jaxrl_vis.stalks.phenotyping.detector.weights import SCHEMA, SHIPPED, read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io import masks
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
@@ -341,25 +338,6 @@ def test_arrays_that_are_not_those_of_the_network_are_reported(tmp_path, kind, p
     (tmp_path / "w.safetensors").write_bytes(save(arrays, about))
     with pytest.raises(RequestError, match=part):
         painter.read_weights(tmp_path / "w.safetensors")
-
-
-def test_weights_of_an_earlier_version_are_converted_bit_for_bit(tmp_path):
-    write_weights(tmp_path / "new.safetensors", *read_weights(SHIPPED))
-    with weights_file.safetensors.safe_open(tmp_path / "new.safetensors", "numpy") as file:
-        about, arrays = json.loads(file.metadata()["about"]), {name: file.get_tensor(name) for name in file.keys()}
-    assert about["schema"] == SCHEMA and {array.dtype for array in arrays.values()} == {np.dtype(np.float16)}
-    text = np.frombuffer(json.dumps(about).encode(), np.uint8)
-    np.savez_compressed(tmp_path / "old.npz", about=text, **arrays)
-    with pytest.raises(
-        RequestError, match="convert it with `python -m jaxrl_vis.host.weights_file .*old.npz .*old.safetensors`"
-    ):
-        read_weights(tmp_path / "old.npz")
-    weights_file.convert(tmp_path / "old.npz", tmp_path / "old.safetensors")
-    assert (tmp_path / "old.safetensors").read_bytes() == (tmp_path / "new.safetensors").read_bytes()
-    (tmp_path / "no.npz").write_bytes(b"no weights")
-    words = [sys.executable, "-m", "jaxrl_vis.host.weights_file", str(tmp_path / "no.npz"), str(tmp_path / "new.safetensors")]
-    done = subprocess.run(words, capture_output=True, text=True)
-    assert done.returncode == 1 and done.stderr.startswith("cannot convert") and len(done.stderr.splitlines()) == 1
 
 
 def test_weights_of_ten_bits_are_off_by_half_a_step_at_most(tmp_path):

@@ -58,27 +58,15 @@ Planes = tuple[Any, ...]
 """Quantities of each pixel, as separate images [rows, columns]: stacking them in one array would cost a copy."""
 
 
-def flow(images_t: jax.Array, images_tp1: jax.Array, settings: Settings = Settings()) -> jax.Array:
-    """Compute the flow from each pixel of the first images: [B, H, W, 2] float32, (right, down) in pixels.
+def flow(images: jax.Array, settings: Settings = Settings()) -> jax.Array:
+    """Compute the flow from each pixel of images to the next image: [T, H, W, 2] float32, (right, down) in pixels.
 
     Args:
-        images_t: [B, H, W] grey levels, 0 to 255, of any dtype.
-        images_tp1: Images one step later, in the same format.
+        images: [T + 1, H, W] grey levels, 0 to 255, of any dtype. Each is expanded only once.
         settings: Window, pyramid, iterations.
     """
-    expand = jax.vmap(functools.partial(_expansions, settings=settings))
-    return _displacements_between(expand(images_t), expand(images_tp1), settings)
-
-
-def flow_along(images: jax.Array, settings: Settings = Settings()) -> jax.Array:
-    """Compute `flow` between successive images, [T + 1, H, W] -> [T, H, W, 2], expanding each image only once."""
     expansions = jax.vmap(functools.partial(_expansions, settings=settings))(images)
     before, after = (jax.tree.map(lambda plane, part=part: plane[part], expansions) for part in (slice(-1), slice(1, None)))
-    return _displacements_between(before, after, settings)
-
-
-def _displacements_between(before: list[Planes], after: list[Planes], settings: Settings) -> jax.Array:
-    """Compute displacements [B, H, W, 2] (right, down) between images with expansions ``before`` and ``after`` [B, ...]."""
     displace = functools.partial(_displacements, settings=settings)
     return jnp.stack(jax.vmap(displace)(before, after), axis=-1)
 

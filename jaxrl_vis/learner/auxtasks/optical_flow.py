@@ -39,7 +39,7 @@ def make(spec: Spec) -> AuxTask:
         init=lambda key: heads.init_decoder(key, 2 * spec.latent_size, (1, height, width), spec.levels),
         predict=lambda params, view: from_blocks(decode(params, view), *size)[:, 0],
         loss=loss,
-        episode=lambda images: to_bytes(flow_strength_along(images, spec.frame_stack, stretch), stretch),
+        episode=lambda images: to_bytes(flow_strength(images, spec.frame_stack, stretch), stretch),
         target=lambda batch: from_bytes(batch.stored, stretch),
         shift=lambda flow, pixels: shift_images(flow[:, None], pixels)[:, 0],
         key_index=4,
@@ -63,32 +63,18 @@ def _scale(stretch: bool) -> float:
     return _MAX_BYTE if stretch else _BYTES_PER_PIXEL
 
 
-def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:
-    """Compute the magnitude of the optical flow at every pixel: [B, H, W] float32, in pixels.
+def flow_strength(images: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:
+    """Compute the magnitude of the optical flow at every pixel between successive images: [T, H, W] float32, in pixels.
 
     Args:
-        images_t: [B, C, H, W] uint8, observations before the action.
-        images_tp1: [B, C, H, W] uint8, observations after the action.
+        images: [T + 1, C, H, W] uint8, observations of an episode.
         frame_stack: Number of images that an observation stacks; the newest ones are used.
         stretch: Whether to stretch each flow image linearly to [0, 1], instead of pixels, as in the authors' release, whose
             grey levels also lie in [0, 1]. This discards speeds, and amplifies rounding errors if nothing moves. At such grey
             levels, Farneback's regularisation dominates (`farneback`), so that the sharpness of edges matters more than their
             speed.
     """
-    unit = _unit(stretch)
-    return _strength(farneback.flow(grey(images_t, frame_stack) / unit, grey(images_tp1, frame_stack) / unit), stretch)
-
-
-def flow_strength_along(images: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:
-    """Compute `flow_strength` between successive images: [T + 1, C, H, W] -> [T, H, W] float32, with its options."""
-    return _strength(farneback.flow_along(grey(images, frame_stack) / _unit(stretch)), stretch)
-
-
-def _unit(stretch: bool) -> float:
-    return 255.0 if stretch else 1.0
-
-
-def _strength(flow: jax.Array, stretch: bool) -> jax.Array:
+    flow = farneback.flow(grey(images, frame_stack) / (255.0 if stretch else 1.0))
     strength = jnp.sqrt(jnp.sum(jnp.square(flow), axis=-1))
     if not stretch:
         return strength

@@ -9,7 +9,7 @@ which process evaluates a plot.
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,49 +94,33 @@ def conditions(task: Task) -> dict[str, Any]:
     }
 
 
-def evaluate_tasks(
-    tasks: Mapping[str, Task],
-    seeds: Sequence[int],
-    paths: Mapping[str, Path | None],
-    started: Callable[[int], None],
-    done: Callable[[str, int, Record], None],
-) -> dict[str, dict[str, Any]]:
-    """Evaluate the same plots for several tasks in parallel processes.
+def evaluate_plots(
+    task: Task, seeds: Sequence[int], path: Path | None, started: Callable[[int], None], done: Callable[[Record], None]
+) -> dict[str, Any]:
+    """Evaluate plots in parallel processes, and return the summary of all, see `scoring.summarize_scores`.
 
     Args:
-        tasks: Name -> task; all have the same `Task.workers` and `Task.min_score`.
+        task: Settings of the evaluation.
         seeds: Seeds of the plots.
-        paths: Name -> JSON file of the task's records, written after each plot; None for no file. Plots that it already holds
-            are not evaluated again.
-        started: Called once with the number of evaluations that the files already hold.
-        done: Called after each plot with the task's name, the seed and the record.
-
-    Returns:
-        Name -> summary of all plots, see `scoring.summarize_scores`.
+        path: JSON file, written after each plot; None for no file. Plots that it already holds are not evaluated again.
+        started: Called once with the number of plots that the file already holds.
+        done: Called with the record of each plot.
 
     Raises:
-        RequestError: A file holds records of another evaluation, or cannot be read.
+        RequestError: The file holds records of another evaluation, or cannot be read.
         WorkerError: A process was killed from outside.
     """
-    names = list(tasks)
-    first = tasks[names[0]]
-    summarize_plots = functools.partial(summarize, first.min_score)
-    tables = {name: RecordFile(paths[name], conditions(task), summarize_plots) for name, task in tasks.items()}
-    started(sum(seed in table for table in tables.values() for seed in seeds))
-    jobs = [(name, seed) for name in names for seed in seeds if seed not in tables[name]]
+    summarize_plots = functools.partial(summarize, task.min_score)
+    table = RecordFile(path, conditions(task), summarize_plots)
+    missing = [seed for seed in seeds if seed not in table]
+    started(len(seeds) - len(missing))
 
-    def keep(number: int, record: Record) -> None:
-        name, seed = jobs[number]
-        tables[name].add(seed, record)
-        done(name, seed, tables[name].records[seed])
+    def keep(seed: int, record: Record) -> None:
+        table.add(seed, record)
+        done(table.records[seed])
 
-    evaluate_all(functools.partial(_evaluate_job, dict(tasks), jobs), range(len(jobs)), first.workers, keep)
-    return {name: summarize_plots([table.records[seed] for seed in seeds]) for name, table in tables.items()}
-
-
-def _evaluate_job(tasks: Mapping[str, Task], jobs: Sequence[tuple[str, int]], number: int) -> Record:
-    name, seed = jobs[number]
-    return evaluate_plot(tasks[name], seed)
+    evaluate_all(functools.partial(evaluate_plot, task), missing, task.workers, keep)
+    return summarize_plots([table.records[seed] for seed in seeds])
 
 
 def read_scores(records: Iterable[Record]) -> list[PlotScore]:

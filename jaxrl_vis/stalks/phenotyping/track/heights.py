@@ -3,13 +3,11 @@
 A stalk is measured as near to a height as its edges are visible. Widths measured at another height are corrected by the taper,
 the decrease in width per inch: the median over stalks of the same plot that were measured at both heights.
 
-A stalk with an occluded edge in all pairs has only a lower bound, often of a sliver beside another stalk. Its width is the mean
-of the posterior distribution, whose prior are the clear widths of the plot.
+Of a stalk with an occluded edge in all pairs, a sliver may be all that was measured; the plot's other widths replace it.
 """
 
 import dataclasses
 import math
-from statistics import NormalDist
 
 import numpy as np
 
@@ -28,11 +26,8 @@ _OCCLUDED_WEIGHT = 4.0  # factor of their weights: their confidence, a tenth of 
 # Errors common to all pairs, which their scatter does not show; estimated on synthetic stalks.
 _MASK_ERROR = 0.7  # pixels: bias of masks on one texture
 _OCCLUSION_ERROR = 1.5  # mm, if an edge may be occluded in all pairs
-# Lower bounds: chosen on synthetic plots of the training family with one factor shifted.
-_CLEAR, _BOUND = 0.5, 0.9  # shares of occluded measurements below which a width is clear, and above which it is a lower bound
-_MIN_CLEAR = 5  # stalks with clear widths that a prior needs
-_MIN_SPREAD = 0.1  # relative: minimum standard deviation of the widths of a plot
-_TIGHT, _TIGHT_ERROR = 0.95, 0.5  # prior probability that a bound is the width itself, and its standard error then, mm
+_CLEAR, _OCCLUDED = 0.5, 0.9  # shares of occluded measurements below and above which a width is clear and a lower bound
+_SLIVER = 0.4  # lower bounds below this fraction of the median of the plot's clear widths are slivers
 _CALIBRATION_ERROR = 0.005  # relative: focal length and baseline of a good calibration
 _FEW = 2.0  # pairs: correction for the underestimated scatter of few pairs
 _MAX_OFFSET = 4.0 * INCH  # m: maximum distance of a measurement from a height
@@ -45,8 +40,8 @@ class Width:
     """Diameter of a stalk, estimated from all its sightings.
 
     Attributes:
-        mm: Weighted median of the diameters, mm; those with an occluded edge count as lower bounds. If all are occluded, the
-            expected width, given their bound and the other widths of the plot.
+        mm: Weighted median of the diameters, mm; those with an occluded edge count as lower bounds. For a sliver, the median of
+            the plot's clear widths.
         error: Standard error, mm: from the scatter between pairs, the common bias of masks, occluded edges, and a good
             calibration. Intervals of +/- 2 standard errors cover about 95 % of synthetic stalks.
         scatter: Standard error from the scatter between pairs alone, mm, at least that from the errors of edges and disparity.
@@ -97,8 +92,8 @@ def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[Stal
     tapers = [width.taper for width in first if width.taper is not None]
     taper = float(np.median(tapers)) if len(tapers) >= _MIN_SIGHTINGS else USUAL_TAPER
     measured = [_widths_of_stalk(sightings, taper) for sightings in of_stalks]
-    lower, upper = (_replace_bounds(widths) for widths in ([w.lower for w in measured], [w.upper for w in measured]))
-    return [dataclasses.replace(w, lower=low, upper=high) for w, low, high in zip(measured, lower, upper)]
+    lower = _replace_slivers([width.lower for width in measured])
+    return [dataclasses.replace(width, lower=mended) for width, mended in zip(measured, lower)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,35 +142,18 @@ def _lower_measurement(sighting: Sighting, height: float) -> _WidthMeasurement:
     return _WidthMeasurement(mm, sighting.deviation_mm, height, weight, sighting.occluded, pixel)
 
 
-def _replace_bounds(widths: list[Width | None]) -> list[Width | None]:
-    """Replace lower bounds by the widths that are expected from them and from the clear widths of the same plot."""
-    clear = np.array([width.mm for width in widths if width is not None and width.occluded < _CLEAR])
-    if len(clear) < _MIN_CLEAR:
+def _replace_slivers(widths: list[Width | None]) -> list[Width | None]:
+    """Replace the widths of slivers by the median of the plot's clear widths, with their standard deviation as the error."""
+    clear = [width.mm for width in widths if width is not None and width.occluded < _CLEAR]
+    if len(clear) < _MIN_SIGHTINGS:
         return widths
-    middle = float(np.median(clear))
-    prior = NormalDist(middle, max(1.4826 * float(np.median(np.abs(clear - middle))), _MIN_SPREAD * middle))
-    return [width if width is None or width.occluded <= _BOUND else _expected_width(width, prior) for width in widths]
-
-
-def _expected_width(bound: Width, prior: NormalDist) -> Width:
-    """Return the posterior mean of a width and its standard error, from a lower bound.
-
-    The bound is either the width itself or that of a part of the stalk, uniform up to the width. In the second case, the
-    posterior is nearly the prior truncated at the bound.
-    """
-    beyond = prior.zscore(bound.mm)
-    tail = NormalDist().cdf(-beyond)
-    if tail < 1e-6:
-        return bound
-    ratio = NormalDist().pdf(beyond) / tail
-    mean = prior.mean + prior.stdev * ratio
-    variance = prior.variance * (1.0 + beyond * ratio - ratio**2)
-    whole = _TIGHT * NormalDist(prior.mean, math.hypot(prior.stdev, _TIGHT_ERROR)).pdf(bound.mm)
-    part = (1.0 - _TIGHT) * tail / mean
-    share = part / (whole + part)
-    mm = bound.mm + share * (mean - bound.mm)
-    error = (1.0 - share) * (bound.error**2 + (bound.mm - mm) ** 2) + share * (variance + (mean - mm) ** 2)
-    return dataclasses.replace(bound, mm=mm, error=math.sqrt(error))
+    usual, spread = float(np.median(clear)), float(np.std(clear))
+    return [
+        width
+        if width is None or width.occluded <= _OCCLUDED or width.mm >= _SLIVER * usual
+        else dataclasses.replace(width, mm=usual, error=spread)
+        for width in widths
+    ]
 
 
 def _view_weight(sighting: Sighting) -> float:
