@@ -110,7 +110,7 @@ def rows_of_boxes(stalks: np.ndarray) -> Band | None:
         return None
     order = np.argsort(stalks[:, [0, 2]].mean(axis=1))
     columns, tops, bottoms = stalks[order][:, [0, 2]].mean(axis=1), stalks[order, 1], stalks[order, 3]
-    return lambda column: (float(np.interp(column, columns, tops)), float(np.interp(column, columns, bottoms)))
+    return lambda column: (float(np.interp(column, columns, tops)), float(np.interp(column, columns, bottoms)), True)
 
 
 def boxes_behind(plot: Plot, pose: Pose, camera: Calibration, band: Band | None) -> np.ndarray:
@@ -131,7 +131,7 @@ def boxes_behind(plot: Plot, pose: Pose, camera: Calibration, band: Band | None)
             continue
         edges = outline(stalk, pose, camera, np.linspace(stalk.points[:, 2].max(), 0.0, 40)) + 0.5  # from the top
         rows = edges[:, :, 1].mean(axis=1)
-        top, bottom = band(float(edges[:, :, 0].mean()))
+        top, bottom, _ = band(float(edges[:, :, 0].mean()))
         inside = np.linspace(max(top, rows[0]), min(bottom, rows[-1]), 20)
         if inside[0] >= inside[-1]:
             continue

@@ -226,22 +226,31 @@ def test_the_band_is_where_the_ground_says():
     for height, column in ((0.2, 100.0), (0.4, 700.0)):
         row = ground.row(column, height, 0.8, camera)
         assert ground.height(column, row, 0.8, camera) == pytest.approx(height)
-    top, bottom = band_rows(None, camera, 0.8, 300.0)
-    assert bottom - top == pytest.approx(0.2 * 542 / 0.8) and top == pytest.approx(337.5 + (0.42 - 0.4048) * 542 / 0.8)
+    top, bottom, is_on_ground = band_rows(None, camera, 0.8, 300.0)
+    assert (
+        not is_on_ground
+        and bottom - top == pytest.approx(0.2 * 542 / 0.8)
+        and top == pytest.approx(337.5 + (0.42 - 0.4048) * 542 / 0.8)
+    )
     chain = Chain(chain_of(*[100.0] * 12), np.full(11, 0.9))
-    stalks, scores = cut_to_band([chain], (2.0, 2.0), lambda column: (99.5, 199.5) if column == 199.5 else (0.0, 0.0))
+    stalks, scores = cut_to_band(
+        [chain], (2.0, 2.0), lambda column: (99.5, 199.5, True) if column == 199.5 else (0.0, 0.0, True)
+    )
     np.testing.assert_allclose(stalks, [[188, 100, 212, 200, 200, 200]])
     assert scores == pytest.approx([chain.score])
-    assert not len(cut_to_band([chain], (2.0, 2.0), lambda column: (800.0, 1000.0))[1])
+    assert not len(cut_to_band([chain], (2.0, 2.0), lambda column: (800.0, 1000.0, True))[1])
     assert len(cut_to_band([chain], (2.0, 2.0), None)[0]) == 1
 
 
 def test_boxes_far_from_the_band_move_there_along_their_axes():
     inside = [88.0, 100.0, 122.0, 200.0, 100.0, 110.0]
     above = [88.0, 60.0, 122.0, 160.0, 100.0, 110.0]
-    moved = move_to_band(np.array([inside, above], np.float32), lambda column: (99.5, 199.5) if column == 104.5 else (0.0, 0.0))
+    stalks = np.array([inside, above], np.float32)
+    moved = move_to_band(stalks, lambda column: (99.5, 199.5, True) if column == 104.5 else (0.0, 0.0, True))
     np.testing.assert_array_equal(moved[0], inside)
     np.testing.assert_allclose(moved[1], [92, 100, 126, 200, 104, 114], atol=1e-4)
+    # Where no ground is visible, the band of the usual cameras says nothing.
+    np.testing.assert_array_equal(move_to_band(stalks, lambda column: (99.5, 199.5, False)), stalks)
 
 
 # --- synthetic stalks, networks and weights ---
@@ -321,13 +330,13 @@ def test_weights_say_whether_they_detect_sections(tmp_path):
     finder = Finder(params, every)
     image = np.random.default_rng(0).integers(0, 255, (64, 64, 3)).astype(np.uint8)
     anywhere, scores, _ = finder.detect_boxes(image, None)
-    inside, _, _ = finder.detect_boxes(image, every.pixels_per_metre, lambda column: (9.5, 49.5))
+    inside, _, _ = finder.detect_boxes(image, every.pixels_per_metre, lambda column: (9.5, 49.5, True))
     assert len(anywhere) == len(scores) > 0 and len(inside) > 0
     assert set(anywhere[:, 1].tolist()) <= {0.0, 32.0} and (inside[:, [1, 3]] == [10.0, 50.0]).all()
     assert anywhere[:, 0].min() < 0.0 or anywhere[:, 2].max() > 64.0
     clipped = [detection.box for detection in Finder(params, every, 0.0)(image)]
     assert clipped and all(-0.5 <= left <= right <= 63.5 for left, _, right, _ in clipped)
-    known = every.pixels_per_metre, lambda column: (9.5, 49.5)
+    known = every.pixels_per_metre, lambda column: (9.5, 49.5, True)
     _, scores, _ = finder.detect_boxes(image, *known)
     of_rows = {round(detection.score, 5) for detection in Finder(params, every, 0.0)(image, *known)}
     assert of_rows and of_rows <= set(np.round(1.0 - np.sqrt(1.0 - scores.astype(np.float64)), 5).tolist())

@@ -65,14 +65,14 @@ class Ground:
         return y * calibration.focal + calibration.centre[1]
 
 
-def band_rows(ground: Ground | None, calibration: Calibration, distance: float, column: float) -> tuple[float, float]:
+def band_rows(ground: Ground | None, calibration: Calibration, distance: float, column: float) -> tuple[float, float, bool]:
     """Return the first and last image row of the band in a column of the left image, for stalks at a ``distance`` in m.
 
-    Without a ground plane, cameras are assumed to be level and at their usual height.
+    Without a ground plane, cameras are assumed to be level and at their usual height, and the third value is False.
     """
     plane = ground or Ground((0.0, 1.0 / _USUAL_HEIGHT, 0.0))
     top, bottom = (plane.row(column, height, distance, calibration) for height in reversed(BAND))
-    return top, bottom
+    return top, bottom, ground is not None
 
 
 def find_ground(

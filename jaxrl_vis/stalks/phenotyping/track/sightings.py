@@ -159,7 +159,7 @@ def detect_with_ground(
     with ThreadPoolExecutor(1) as aside:
         ground = aside.submit(lambda: find_ground(to_grey_bytes(left), to_grey_bytes(right), calibration, disparity))
 
-        def band(column: float) -> tuple[float, float]:  # waits for the ground, but not before a detector asks
+        def band(column: float) -> tuple[float, float, bool]:  # waits for the ground, but not before a detector asks
             return band_rows(ground.result(), calibration, distance, column)
 
         return find(left, calibration.focal / distance, band), ground.result()
