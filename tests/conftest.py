@@ -17,9 +17,8 @@ from typing import Any
 
 # Compilation allocates millions of small objects, and takes a tenth less time with this allocator. The processes that pytest
 # distributes tests to inherit it, as do those that tests start.
-ALLOCATOR = Path(sysconfig.get_path("purelib"), "cmeel.prefix/lib/libmimalloc.so")
-if sys.platform == "linux" and ALLOCATOR.exists():
-    os.environ.setdefault("LD_PRELOAD", str(ALLOCATOR))
+if (allocator := Path(sysconfig.get_path("purelib"), "cmeel.prefix/lib/libmimalloc.so")).exists() and sys.platform == "linux":
+    os.environ.setdefault("LD_PRELOAD", str(allocator))
     os.environ.setdefault("MIMALLOC_PURGE_DELAY", "-1")
 
 # Read by JAX at its first import, so set before any test module is imported.
@@ -32,12 +31,6 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ["JAXRL_VIS_KEEP_PROGRAMS"] = "0"
 # Where each operation was called from, all the way up, is a twentieth of what there is to compile.
 os.environ.setdefault("JAX_INCLUDE_FULL_TRACEBACKS_IN_LOCATIONS", "0")
-SKIPPED_PASSES = (
-    *("while-loop-invariant-code-motion", "simplify-while-loops", "apply-xla-transforms"),
-    *("while-loop-constant-sinking", "simplify-conditional", "reshape-mover"),
-    *("post_scatter_expansion_simplification", "dynamic-dimension-simplifier", "tree_reduction_rewriter"),
-    *("batch-dot-simplification", "gemv-rewriter", "cpu-parallel-task-assigner"),
-)
 # Programs of tests run for a moment: optimising their machine code takes longer. What XLA makes of them before is the same.
 # Three passes that improve loops take an eighth of the rest, and change no result.
 # Both cores are busy with tests, so a program is not split into parts that could be compiled side by side either.
@@ -49,7 +42,10 @@ os.environ["XLA_FLAGS"] = " ".join(
         os.environ.get("XLA_FLAGS", ""),
         "--xla_backend_optimization_level=0",
         "--xla_cpu_parallel_codegen_split_count=1",
-        f"--xla_disable_hlo_passes={','.join(SKIPPED_PASSES)}",
+        "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,apply-xla-transforms"
+        ",while-loop-constant-sinking,simplify-conditional,reshape-mover,post_scatter_expansion_simplification"
+        ",dynamic-dimension-simplifier,tree_reduction_rewriter,batch-dot-simplification,gemv-rewriter"
+        ",cpu-parallel-task-assigner",
         *(["--xla_cpu_use_fusion_emitters=false"] if version("jaxlib").startswith("0.10.") else []),
     )
 )
