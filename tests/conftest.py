@@ -15,8 +15,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-# Compilation allocates millions of small objects, and takes a tenth less time with this allocator. The processes that pytest
-# distributes tests to inherit it, as do those that tests start.
+# Compilation allocates millions of small objects, which takes a tenth less time with this allocator. pytest's workers inherit
+# it, as do processes that tests start.
 if (allocator := Path(sysconfig.get_path("purelib"), "cmeel.prefix/lib/libmimalloc.so")).exists() and sys.platform == "linux":
     os.environ.setdefault("LD_PRELOAD", str(allocator))
     os.environ.setdefault("MIMALLOC_PURGE_DELAY", "-1")
@@ -32,9 +32,9 @@ os.environ["JAXRL_VIS_KEEP_PROGRAMS"] = "0"
 # Where each operation was called from, all the way up, is a twentieth of what there is to compile.
 os.environ.setdefault("JAX_INCLUDE_FULL_TRACEBACKS_IN_LOCATIONS", "0")
 # Programs of tests run for a moment: optimising their machine code takes longer. What XLA makes of them before is the same.
-# Three passes that improve loops take an eighth of the rest, and change no result.
+# Three passes that improve loops take an eighth of the rest, and change no result. Nine more, for loops, scatters and large
+# products, of which the programs of tests have few, take a twelfth.
 # Both cores are busy with tests, so a program is not split into parts that could be compiled side by side either.
-# Nine further passes concern loops, scatters and large products that programs of tests hardly have; they take a twelfth.
 # Fusion emitters take as long to compile as all the rest, and programs of environments do without them anyway, see
 # `compilation.compiler_options`. JAX 0.11 does not know the option any more, and would end the process.
 os.environ["XLA_FLAGS"] = " ".join(
