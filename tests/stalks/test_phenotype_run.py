@@ -109,7 +109,8 @@ def test_eval_in_two_processes_and_after_a_stop_is_the_same(plots, tmp_path, cap
     [
         (["train", "weights.bin"], "ends in .safetensors"),
         (["train", "weights.safetensors", "--minutes", "0"], "--minutes must be more than 0"),
-        (["train", "weights.safetensors", "--data", "images", "--width", "422"], "leave out --spec and --width"),
+        (["train", "weights.safetensors", "--data", "images", "--width", "422"], "leave out --spec, --mix and --width"),
+        (["train", "weights.safetensors", "--data", "images", "--mix", "daylight.toml"], "leave out --spec, --mix"),
         (["train", "weights.safetensors", "--data", "images", "--images", "800"], "--images and --workers"),
         (["train", "weights.safetensors", "--data", "images", "--workers", "4"], "--images and --workers"),
         (["train", "weights.safetensors", "--data", "images"], "there are no annotations"),

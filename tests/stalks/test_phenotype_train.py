@@ -1,6 +1,7 @@
 """Tests of training on annotated images: initial weights, networks that boxes alone leave unchanged, sizes, and masks."""
 
 import dataclasses
+import itertools
 import json
 import shutil
 from pathlib import Path
@@ -19,6 +20,7 @@ from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights,
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.calibration import write_calibration
 from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask, rasterize_polygons
+from jaxrl_vis.stalks.phenotyping.training import detector_training, examples
 from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, fit_settings
 from jaxrl_vis.stalks.phenotyping.training.detector_training import OUTPUTS
 from jaxrl_vis_envs.plants import Calibration
@@ -298,3 +300,21 @@ def test_outlines_beyond_the_image_and_of_several_parts():
     parts = [[-7, -3, 5, -3, 5, 4, -7, 4], [0, 0, 3, 0, 3, 3, 0, 3], [9, 6, 30, 6, 30, 30, 9, 30]]
     np.testing.assert_array_equal(rasterize_polygons(parts, (10, 12)), inside)  # parts that overlap are not holes
     assert not rasterize_polygons([[20, 20, 30, 20, 30, 30]], (10, 12)).any()
+
+
+def test_plots_of_several_families_take_turns(weights, tmp_path, monkeypatch):
+    drawn = []
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.toml").write_text(f'base = "training"\nname = "{name}"\n')
+    monkeypatch.setattr(examples, "synthetic_examples", lambda family, settings, seed: [(family.name, seed)])
+
+    def read_examples(sources, settings, plan, report, start):
+        drawn.extend(itertools.islice(sources[0], 4))
+        return start, 0
+
+    monkeypatch.setattr(detector_training, "train", read_examples)
+    out = tmp_path / "out.safetensors"
+    words = ["--spec", str(tmp_path / "one.toml"), "--mix", str(tmp_path / "two.toml"), "--start", str(weights)]
+    assert cli.main(["phenotype", "train", str(out), *words, "--workers", "1"]) == 0
+    assert drawn == [("one", 100_000), ("two", 100_001), ("one", 100_002), ("two", 100_003)]
+    assert read_weights(out)[2]["origin"] == f"synthetic plots of families one and two, from {weights}"

@@ -172,6 +172,8 @@ class TrainingOptions(PlantOptions):
 class DetectorTraining(TrainingOptions):
     """Train the networks that detect and segment stalks, on synthetic plots or on your own annotated images."""
 
+    mix: tuple[Path, ...] = ()
+    """Files of further families, as for --spec: plots of each family take turns."""
     data: Path | None = None
     """Folder of annotated images to train on instead of synthetic plots: COCO (of CVAT, Roboflow, Label Studio, ...), Pascal
     VOC, LabelMe, YOLO, CVAT or Label Studio, with the images beside the annotations or in subfolders."""

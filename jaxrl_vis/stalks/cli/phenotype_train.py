@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,8 @@ from jaxrl_vis.stalks.cli.tuning import train_on_images
 
 if TYPE_CHECKING:
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
+    from jaxrl_vis.stalks.phenotyping.training.examples import Example
+    from jaxrl_vis_envs.plants import Family
 
 _FIRST_SEED = 100_000
 """First seed of the training plots with --seed 0; lower seeds are for evaluation."""
@@ -39,10 +41,10 @@ def train(options: DetectorTraining) -> int:
     """
     check_counts(crops=options.crops)
     options.check()
-    drawn = (options.family, options.shift, options.spec, options.frames, options.width, options.images, options.workers)
-    if options.data is not None and any(drawn):
+    drawn = (options.family, options.shift, options.spec, options.mix, options.frames, options.width)
+    if options.data is not None and any((*drawn, options.images, options.workers)):
         raise RequestError(
-            "--data takes images of your own: leave out --spec and --width, --family, --shift, --frames, --images and "
+            "--data takes images of your own: leave out --spec, --mix and --width, --family, --shift, --frames, --images and "
             "--workers, which are for synthetic ones"
         )
     if options.label and options.data is None:
@@ -62,16 +64,17 @@ def _train(options: DetectorTraining) -> int:
     from jaxrl_vis import __version__
     from jaxrl_vis.stalks.phenotyping.detector.weights import write_weights
     from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, train
-    from jaxrl_vis.stalks.phenotyping.training.examples import Example, synthetic_examples
+    from jaxrl_vis.stalks.phenotyping.training.examples import Example
 
-    family = options.read_family("phenotyping")
-    before, settings, origin_before = _start(options, family.scene.share > 0)
+    mixed = [dataclasses.replace(options, family=None, shift=(), spec=spec) for spec in options.mix]
+    families = [source.read_family("phenotyping") for source in (options, *mixed)]
+    before, settings, origin_before = _start(options, any(family.scene.share > 0 for family in families))
     first = _FIRST_SEED * (1 + options.seed)
-    draw = functools.partial(synthetic_examples, family, settings)
+    draw = functools.partial(_draw_examples, families, settings)
     sources: list[Iterator[Example]] = [
         itertools.chain.from_iterable(map_unordered(draw, itertools.count(first), options.workers or DEFAULT_WORKERS))
     ]
-    origin = f"synthetic plots of family {family.name}"
+    origin = f"synthetic plots of {'families' if options.mix else 'family'} {' and '.join(family.name for family in families)}"
     images = options.images or DEFAULT_IMAGES
     plan = Plan(
         steps=options.steps or DEFAULT_STEPS,
@@ -97,6 +100,13 @@ def _train(options: DetectorTraining) -> int:
     write_weights(options.out, params, settings, {**about, "steps": steps})
     print(f"{options.out}: {steps} updates on {origin}{origin_before}, {options.out.stat().st_size / 1e6:.1f} MB")
     return 0
+
+
+def _draw_examples(families: "Sequence[Family]", settings: "Settings", seed: int) -> "list[Example]":
+    """Return the examples of the plot of a seed, of one family after the other."""
+    from jaxrl_vis.stalks.phenotyping.training.examples import synthetic_examples
+
+    return synthetic_examples(families[seed % len(families)], settings, seed)
 
 
 def _start(options: DetectorTraining, is_daytime: bool) -> tuple[Any, "Settings", str]:
