@@ -8,7 +8,9 @@ import pytest
 from phenotype_plots import run, table
 
 from jaxrl_vis import cli
+from jaxrl_vis.stalks.cli.options import PlantOptions
 from jaxrl_vis.stalks.phenotyping.io.images import read_image
+from jaxrl_vis_envs.plants import FAMILIES, shift
 
 
 def test_run_counts_and_measures(plots, results):
@@ -189,3 +191,12 @@ def test_what_is_not_an_evaluation(tmp_path, capsys):
         path.write_text(text)
         assert cli.main(["phenotype", "figure", "3.4", "--out", str(tmp_path / "a.png"), "--evaluation", str(path)]) == 2
         assert "holds no evaluation" in capsys.readouterr().err
+
+
+def test_a_single_factor_is_shifted_from_the_training_family():
+    lean = shift(FAMILIES["training"], "lean")
+    assert PlantOptions(shift=("lean",)).read_family("phenotyping", default="shifted") == lean
+    assert PlantOptions(shift=("lean",)).read_family("phenotyping") == lean
+    assert PlantOptions().read_family("phenotyping", default="shifted") == FAMILIES["shifted"]
+    both = PlantOptions(family="shifted", shift=("lean",)).read_family("phenotyping")
+    assert both == shift(FAMILIES["shifted"], "lean") != FAMILIES["shifted"]

@@ -68,7 +68,7 @@ class PlantOptions:
 
     family: Literal["training", "shifted"] | None = None
     """Family of plants: `training`, the training distribution, or `shifted`, with all factors shifted. If not given, `shifted`
-    for `phenotype eval` and `training` otherwise."""
+    for `phenotype eval` without --shift and `training` otherwise."""
     shift: tuple[str, ...] = ()
     """Factors of the family to shift alone: flash, lean, rig, noise, leaves, textures."""
     spec: Path | None = None
@@ -96,7 +96,7 @@ class PlantOptions:
 
         Args:
             purpose: Application, whose families are meant by ``--family``.
-            default: Name of the family if neither ``--family`` nor ``--spec`` is given.
+            default: Name of the family if neither ``--family``, ``--shift`` nor ``--spec`` is given.
 
         Raises:
             RequestError: The options contradict each other, or a value or the file of a family is invalid.
@@ -108,7 +108,8 @@ class PlantOptions:
         if self.spec is not None and (self.shift or self.family not in (None, "training")):
             raise RequestError("--spec describes the whole family: leave out --family and --shift")
         try:
-            family = families[self.family or default] if self.spec is None else read(self.spec, families)
+            name = self.family or ("training" if self.shift else default)
+            family = families[name] if self.spec is None else read(self.spec, families)
             if self.shift:
                 family = shift(family, *self.shift)
             if self.width is not None:
