@@ -347,13 +347,13 @@ def test_weights_say_whether_they_detect_sections(tmp_path):
     [(3.0, None, True, False), (3.0, 250.0, False, False), (1.5, 250.0, True, False), (-1.0, 250.0, True, True)],
 )
 def test_images_of_unknown_cameras_and_doubtful_ones_are_read_by_other_networks(threshold, camera, is_replaced, is_flagged):
-    by_day, gate = load_finder(PHOTOGRAPHS, 0.0), read_gate(SHIPPED)
-    assert gate is not None and load_finder(SHIPPED, 0.0)._substitute is by_day
+    by_day, gate = load_finder(PHOTOGRAPHS, 0.95), read_gate(SHIPPED)  # of a few boxes, as each takes time
+    assert gate is not None and load_finder(SHIPPED, 0.95)._substitute is by_day
     judged = dataclasses.replace(gate, threshold=threshold)
-    finder = Finder(*read_weights(SHIPPED)[:2], 0.0, judged, by_day)
+    finder = Finder(*read_weights(SHIPPED)[:2], 0.6, judged, by_day)
     image = np.random.default_rng(0).integers(0, 256, (96, 128, 3), np.uint8)
     detections = finder(image, camera)
     boxes, others = ([detection.box for detection in found] for found in (detections, by_day(image, camera)))
-    assert others and (boxes == others) == is_replaced
+    assert boxes and others and (boxes == others) == is_replaced
     if camera is not None:
         assert (detections.doubt > detections.max_doubt) == is_flagged  # although other networks have read the image

@@ -25,6 +25,16 @@ FRESH_FAMILIES = {
 }
 """Descriptions by name of the family, and of its record in ``phenotyping/families`` or ``phenotyping/fresh``."""
 
+FACTORS = {
+    "flash": "flash",
+    "lean": "lean",
+    "rig": "baseline and focal length (`rig`)",
+    "noise": "noise",
+    "leaves": "leaves",
+    "textures": "textures",
+}
+"""Descriptions by name of the factor that is shifted alone, and of its record in ``phenotyping/factors``."""
+
 
 def lens_table(results: Path = RESULTS) -> str | None:
     """Return the table of lenses as Markdown; None without a record."""
@@ -98,6 +108,28 @@ def _table_of_families(folder: Path, titles: dict[str, str]) -> str | None:
     if not origins:
         return None
     return "\n".join([*lines, "", origin_sentence([Record("families", (), frozenset(origins))])])
+
+
+def factors_table(results: Path = RESULTS) -> str | None:
+    """Return a table with a row for each factor of the shifted family by itself; None without records."""
+    folder = results / "phenotyping"
+    paths = {
+        "none": folder / "families" / "training.json",
+        **{title: folder / "factors" / f"{factor}.json" for factor, title in FACTORS.items()},
+        "all": folder / "families" / "shifted.json",
+    }
+    records = {title: read_json(path) for title, path in paths.items() if path.exists()}
+    if not records.keys() >= set(FACTORS.values()):
+        return None
+    lines = [
+        "| shifted | error of the count (bias, R²) | error of widths, mm (bias) | AP50 | F1 (precision, recall) |",
+        "|---|---|---|---|---|",
+    ]
+    for title, record in records.items():
+        cells = title, _count_cell(record), _width_cell(record), f"{record['ap50']:.3f}", _f1_cell(record)
+        lines.append("| " + " | ".join(cells) + " |")
+    origins = frozenset().union(*map(_origins, records.values()))
+    return "\n".join([*lines, "", origin_sentence([Record("factors", (), origins)])])
 
 
 def thesis_table(results: Path = RESULTS) -> str | None:
