@@ -1,18 +1,16 @@
 """Shared fixtures and hooks. Tests run on the CPU and share a persistent compilation cache across workers and runs."""
 
-import functools
 import gc
 import getpass
+import itertools
 import os
 import signal
 import sys
 import sysconfig
 import tempfile
-import zlib
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 # Compilation allocates millions of small objects, which takes a tenth less time with this allocator. pytest's workers inherit
@@ -52,8 +50,8 @@ os.environ["XLA_FLAGS"] = " ".join(
 
 import hypothesis
 import jax
-import jax._src.compilation_cache
 import pytest
+import quick_jax  # noqa: F401 (its import is what counts)
 
 # Test files share fixtures and small helpers across folders.
 sys.path.extend(str(folder) for folder in sorted(Path(__file__).parent.iterdir()) if folder.is_dir())
@@ -80,14 +78,6 @@ hypothesis.settings.register_profile(
     print_blob=True,
 )
 hypothesis.settings.load_profile("suite")
-
-# What JAX keeps of a program is read once or twice: to compress it well takes longer than that.
-jax._src.compilation_cache.zlib = SimpleNamespace(
-    compress=functools.partial(zlib.compress, level=1), decompress=zlib.decompress
-)
-
-# Tracing makes millions of small objects, few of them garbage: looked for as often as by default, it costs a tenth of it all.
-gc.set_threshold(100_000, 20, 20)
 
 
 @pytest.fixture
@@ -161,6 +151,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=rank)
 
 
+_FILES_PER_COLLECTION = 5
+_finished_files = itertools.count(1)
+
+
 def _spare_the_collector() -> None:
     """Exempt present objects (modules, compiled programs), most of which stay, from further garbage collection."""
     gc.collect()
@@ -184,7 +178,9 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
     if last_of_group and mappings.exists() and mappings.read_bytes().count(b"\n") > _MANY_MEMORY_MAPPINGS:
         jax.clear_caches()
         gc.unfreeze()
-    _spare_the_collector()
+        _spare_the_collector()
+    elif next(_finished_files) % _FILES_PER_COLLECTION == 0:
+        _spare_the_collector()
 
 
 @pytest.hookimpl(optionalhook=True)

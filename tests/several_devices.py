@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import probe_environments as probes
+import quick_jax  # noqa: F401
 from learners import train_iteration
 
 from jaxrl_vis.config import preset

@@ -18,6 +18,7 @@ def train(options) -> int:
         distributed.start(distributed.Rank(options["coordinator"], options["count"], options["index"]), 60)
     import jax
     import probe_environments as probes
+    import quick_jax  # noqa: F401
 
     from jaxrl_vis.config import preset
     from jaxrl_vis.learner.train_step import make_train_step

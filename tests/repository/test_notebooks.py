@@ -54,6 +54,7 @@ def test_outputs_are_stripped(path: Path, nbformat: Any) -> None:
 _ALIKE = f"""
 import sys
 sys.path.append({str(Path(__file__).resolve().parents[1])!r})
+import quick_jax
 import small_program
 from jaxrl_vis.run import trainer
 trainer.make_train_step = small_program.make_train_step
@@ -67,7 +68,6 @@ def kernel(tmp_path_factory: pytest.TempPathFactory, nbclient: Any) -> Iterator[
     checkout, ipython = Path(__file__).resolve().parents[2], tmp_path_factory.mktemp("ipython")
     startup = ipython / "profile_default/startup"
     startup.mkdir(parents=True)
-    (startup / "garbage.py").write_text("import gc\ngc.set_threshold(100_000, 20, 20)\n")  # as in conftest.py
     (startup / "programs.py").write_text(_ALIKE)
     changes = {
         "PYTHONPATH": os.pathsep.join((str(checkout), str(checkout / "envs"))),

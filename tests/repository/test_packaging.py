@@ -2,6 +2,7 @@
 
 import ast
 import fnmatch
+import functools
 import graphlib
 import os
 import re
@@ -51,14 +52,15 @@ ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (
 PACKAGES = {"jaxrl_vis": (ROOT / "jaxrl_vis", LAYERS), "jaxrl_vis_envs": (ROOT / "envs" / "jaxrl_vis_envs", ENVIRONMENT_LAYERS)}
 
 
-def imported(path: Path, when_running: bool = True) -> set[str]:
+@functools.cache
+def imported(path: Path, when_running: bool = True) -> frozenset[str]:
     """Return the full names of all modules that a file imports; `from a import b` counts as a.b.
 
     Args:
         path: The file.
         when_running: If true, leave out imports for type checkers only.
     """
-    found = set()
+    found: set[str] = set()
     tree = ast.parse(path.read_text())
     blocks = [node for node in ast.walk(tree) if isinstance(node, ast.If)]
     for_types = [node for block in blocks if "TYPE_CHECKING" in ast.unparse(block.test) for node in ast.walk(block)]
@@ -70,7 +72,7 @@ def imported(path: Path, when_running: bool = True) -> set[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+    return frozenset(found)
 
 
 def modules_of(package: str) -> dict[str, Path]:
