@@ -10,8 +10,10 @@ import zlib
 from types import SimpleNamespace
 from typing import Any
 
+import jax
 import jax._src.compilation_cache
 import jax._src.interpreters.mlir
+import jax._src.source_info_util
 
 # Tracing makes millions of small objects, few of them garbage: looked for as often as by default, it costs a tenth of it all.
 gc.set_threshold(100_000, 20, 20)
@@ -21,9 +23,9 @@ jax._src.compilation_cache.zlib = SimpleNamespace(
     compress=functools.partial(zlib.compress, level=1), decompress=zlib.decompress
 )
 
-# JAX makes a new MLIR context for each program that it lowers, which takes as long as compiling a single operation. A context
-# holds constants of its programs until it is freed, so it is replaced from time to time.
-_PROGRAMS_PER_CONTEXT = 50
+# JAX 0.10 makes a new MLIR context for each program that it lowers, which takes as long as compiling a single operation. JAX
+# 0.11 uses each one several times, too; not for longer, as a context keeps the constants of its programs.
+_PROGRAMS_PER_CONTEXT = 10
 _contexts = threading.local()  # programs are also lowered in threads
 _make_context = jax._src.interpreters.mlir.make_ir_context
 
@@ -35,4 +37,11 @@ def _shared_context() -> Any:
     return _contexts.shared
 
 
-jax._src.interpreters.mlir.make_ir_context = _shared_context
+def _place_without_traceback() -> Any:
+    """Return where an operation is traced: its names, without the lines that called it, which only messages of errors show."""
+    return jax._src.source_info_util._source_info_context.context
+
+
+if jax.__version__.startswith("0.10."):
+    jax._src.interpreters.mlir.make_ir_context = _shared_context
+    jax._src.source_info_util.current = _place_without_traceback
