@@ -13,7 +13,6 @@ from typing import Any
 import jax
 import jax._src.compilation_cache
 import jax._src.interpreters.mlir
-import jax._src.source_info_util
 
 # Tracing makes millions of small objects, few of them garbage: looked for as often as by default, it costs a tenth of it all.
 gc.set_threshold(100_000, 20, 20)
@@ -37,11 +36,5 @@ def _shared_context() -> Any:
     return _contexts.shared
 
 
-def _place_without_traceback() -> Any:
-    """Return where an operation is traced: its names, without the lines that called it, which only messages of errors show."""
-    return jax._src.source_info_util._source_info_context.context
-
-
 if jax.__version__.startswith("0.10."):
     jax._src.interpreters.mlir.make_ir_context = _shared_context
-    jax._src.source_info_util.current = _place_without_traceback
