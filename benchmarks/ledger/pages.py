@@ -61,7 +61,7 @@ PAGES: dict[str, dict[str, Writer]] = {
         "families": stalks.families_table,
         "fresh": stalks.fresh_table,
         "thesis": stalks.thesis_table,
-        "shifts": stalks.factors_table,
+        "shifts": stalks.shifts_table,
     },
     "docs/export.md": {"policies": exported.exported_table},
     "docs/algorithms.md": {"forms": contrastive.forms_table},

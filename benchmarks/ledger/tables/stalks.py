@@ -1,4 +1,4 @@
-"""Tables of docs/phenotyping.md: lenses (`benchmarks.stalks.lenses`), and widths and families (`phenotype eval --json`)."""
+"""Tables of docs/phenotyping.md: lenses (`benchmarks.stalks.lenses`), and widths, families and shifts (`phenotype eval --json`)."""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ FRESH_FAMILIES = {
 }
 """Descriptions by name of the family, and of its record in ``phenotyping/families`` or ``phenotyping/fresh``."""
 
-FACTORS = {
+SHIFTS = {
     "flash": "flash",
     "lean": "lean",
     "rig": "baseline and focal length (`rig`)",
@@ -33,7 +33,7 @@ FACTORS = {
     "leaves": "leaves",
     "textures": "textures",
 }
-"""Descriptions by name of the factor that is shifted alone, and of its record in ``phenotyping/factors``."""
+"""Descriptions by name of the factor that is shifted alone, and of its record in ``phenotyping/shifts``."""
 
 
 def lens_table(results: Path = RESULTS) -> str | None:
@@ -110,26 +110,27 @@ def _table_of_families(folder: Path, titles: dict[str, str]) -> str | None:
     return "\n".join([*lines, "", origin_sentence([Record("families", (), frozenset(origins))])])
 
 
-def factors_table(results: Path = RESULTS) -> str | None:
-    """Return a table with a row for each factor of the shifted family by itself; None without records."""
+def shifts_table(results: Path = RESULTS) -> str | None:
+    """Return a table with a row for each factor of the shifted family by itself; None if a record is missing."""
     folder = results / "phenotyping"
     paths = {
         "none": folder / "families" / "training.json",
-        **{title: folder / "factors" / f"{factor}.json" for factor, title in FACTORS.items()},
+        **{title: folder / "shifts" / f"{factor}.json" for factor, title in SHIFTS.items()},
         "all": folder / "families" / "shifted.json",
     }
-    records = {title: read_json(path) for title, path in paths.items() if path.exists()}
-    if not records.keys() >= set(FACTORS.values()):
+    if not all(path.exists() for path in paths.values()):
         return None
     lines = [
         "| shifted | error of the count (bias, R²) | error of widths, mm (bias) | AP50 | F1 (precision, recall) |",
         "|---|---|---|---|---|",
     ]
-    for title, record in records.items():
+    origins: set[str] = set()
+    for title, path in paths.items():
+        record = read_json(path)
+        origins |= _origins(record)
         cells = title, _count_cell(record), _width_cell(record), f"{record['ap50']:.3f}", _f1_cell(record)
         lines.append("| " + " | ".join(cells) + " |")
-    origins = frozenset().union(*map(_origins, records.values()))
-    return "\n".join([*lines, "", origin_sentence([Record("factors", (), origins)])])
+    return "\n".join([*lines, "", origin_sentence([Record("shifts", (), frozenset(origins))])])
 
 
 def thesis_table(results: Path = RESULTS) -> str | None:
