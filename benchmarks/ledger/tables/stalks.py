@@ -1,4 +1,4 @@
-"""Tables of docs/phenotyping.md: lenses (`benchmarks.stalks.lenses`), and widths, families and shifts (`phenotype eval --json`)."""
+"""Tables of docs/phenotyping.md: lenses (`benchmarks.stalks.lenses`), widths, families and shifts (`phenotype eval --json`)."""
 
 from pathlib import Path
 from typing import Any
