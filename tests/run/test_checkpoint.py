@@ -1,5 +1,6 @@
 """Checkpoints: round trips, damage, kills while writing."""
 
+import asyncio
 import itertools
 import os
 import shutil
@@ -159,6 +160,19 @@ def test_complaints_about_a_damaged_checkpoint_that_come_late_are_not_shown(stat
     assert "late" not in shown
     Late()
     assert "late" in shown  # what fails in the main thread is ours
+
+
+def test_reads_that_orbax_abandons_are_not_reported(states, saved, caplog):
+    """Of several reads that fail, orbax raises one error; the event loop reports the others whenever they are deleted."""
+    damage(saved / FULL / "3", "delete data")
+    checkpoints = Checkpoints(saved, lambda _: None)
+    checkpoints.restore_for_resume(states[1])
+    checkpoints.close()
+    event_loop = asyncio.new_event_loop()
+    for error in ('Error opening "zarr" driver', "an error of the caller's own"):
+        event_loop.create_future().set_exception(ValueError(error))
+    event_loop.close()
+    assert "zarr" not in caplog.text and "of the caller's own" in caplog.text
 
 
 def test_only_light_left(states, saved):
