@@ -80,6 +80,16 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("suite")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def short_waits() -> Iterator[None]:
+    """Look for the end of other processes more often than commands do, and measure the machine's load and speed for less long."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxrl_vis.studies.engine.grid._POLL_S", 0.02)
+        patch.setattr("jaxrl_vis.bench.conditions._SAMPLE_S", 0.02)
+        patch.setattr("jaxrl_vis.bench.conditions._CALIBRATION_S", 0.002)
+        yield
+
+
 @pytest.fixture
 def checkout() -> Path:
     """Root folder of the checkout, which holds pyproject.toml."""

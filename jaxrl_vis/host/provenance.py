@@ -84,13 +84,15 @@ def install_command(extra: str) -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of `PACKAGES`; `NOT_INSTALLED` for missing ones."""
-    installed = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            installed[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            installed[package] = NOT_INSTALLED
-    return installed
+    return {"python": platform.python_version()} | {package: _installed_version(package) for package in PACKAGES}
+
+
+@functools.cache
+def _installed_version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return NOT_INSTALLED
 
 
 def device_record() -> dict[str, Any]:
