@@ -21,7 +21,7 @@ from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, fi
 from jaxrl_vis.stalks.phenotyping.measure.width import Strip, fit_strip
 from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
 
-_BATCH, _BATCH_ON_ACCELERATOR = 8, 32  # stalk crops per batch
+_BATCH, _BATCH_ON_ACCELERATOR = 2, 32  # stalk crops per batch; on a CPU, larger ones save nothing and are filled up more often
 _MIN_VISIBLE = 0.5  # minimum fraction of a stalk's axis outside black borders
 _MAX_ENLARGED = 3.0  # at more, a stalk is only three pixels wide and cannot be recognised
 _SUBSTITUTE_DOUBT = 0.5  # fraction of the maximum doubt from which a substitute reads an image: at night it is hardly worse
