@@ -82,7 +82,7 @@ hypothesis.settings.load_profile("suite")
 
 @pytest.fixture(scope="session", autouse=True)
 def short_waits() -> Iterator[None]:
-    """Look for the end of other processes more often than commands do, and measure the machine's load and speed for less long."""
+    """Look for the end of other processes more often than commands do, and measure the machine's speed for less long."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jaxrl_vis.studies.engine.grid._POLL_S", 0.02)
         patch.setattr("jaxrl_vis.bench.conditions._SAMPLE_S", 0.02)

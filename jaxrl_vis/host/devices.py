@@ -177,6 +177,9 @@ class Device:
     environment: Mapping[str, str]
 
 
+CPU = "the CPU"
+"""Name of the only device on a machine without accelerators."""
+
 # Run in a separate process: once initialised, JAX holds some of a GPU's memory until the process ends.
 _LIST_DEVICES = """
 import json, sys
@@ -205,7 +208,7 @@ def list_devices() -> list[Device]:
     devices = json.loads(lines[-1])
     (platform, kind), count = devices[0], len(devices)
     if platform not in ("gpu", "cuda") or count == 1:
-        return [Device("the CPU" if platform == "cpu" else kind, {})]
+        return [Device(CPU if platform == "cpu" else kind, {})]
     visible = [word.strip() for word in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if word.strip()]
     names = visible if len(visible) == count else [str(number) for number in range(count)]
     return [Device(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}) for name in names]

@@ -34,8 +34,8 @@ Record = dict[str, Any]
 A = TypeVar("A")
 T = TypeVar("T")
 
-# Variables that limit the threads of NumPy, SciPy, OpenCV and XLA in a process.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC")
+# Variables that limit the threads of NumPy, SciPy and OpenCV in a process, and those of XLA.
+_THREADS, _XLA_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "NPROC"
 _CHECK_INTERVAL = 1.0  # s without a result after which workers that ended are looked for
 
 
@@ -162,10 +162,12 @@ def _worker_env_vars(workers: int) -> list[dict[str, str]]:
     """Return the environment variables of the workers: their GPU, if there are several, and their number of threads."""
     import jax
 
-    from jaxrl_vis.host.devices import list_devices
+    from jaxrl_vis.host.devices import CPU, list_devices
 
     devices = list_devices()
-    threads = dict.fromkeys(_THREADS, str(max(num_cores() // workers, 1)))
+    # With an accelerator, XLA needs its threads only to compile: for minutes with one, for seconds with many.
+    limited = (*_THREADS, _XLA_THREADS) if devices[0].name == CPU else _THREADS
+    threads = dict.fromkeys(limited, str(max(num_cores() // workers, 1)))
     # Workers open no window; otherwise importing MuJoCo would start a process that looks for GLFW and outlives the worker.
     share = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", "MUJOCO_GL": os.environ.get("MUJOCO_GL", "disable")}
     if cache := jax.config.jax_compilation_cache_dir:  # a program is compiled once for all

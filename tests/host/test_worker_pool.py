@@ -23,6 +23,7 @@ from jaxrl_vis.errors import RequestError, Terminated, WorkerError
 from jaxrl_vis.host import devices
 from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all, map_unordered
 from jaxrl_vis.run import signals
+from jaxrl_vis_envs.cores import num_cores
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -35,6 +36,10 @@ def devices_are_listed_once() -> Iterator[None]:
 
 def squared(offset: int, number: int) -> Record:
     return {"square": number * number + offset, "process": os.getpid(), "threads": os.environ.get("OMP_NUM_THREADS")}
+
+
+def threads_of_xla(number: int) -> Record:
+    return {"threads": os.environ.get("NPROC")}
 
 
 def loads_glfw(number: int) -> Record:
@@ -96,6 +101,16 @@ def test_results_are_the_same_in_one_process_and_in_several():
     assert {record["process"] for record in one.values()} == {os.getpid()}
     assert os.getpid() not in {record["process"] for record in two.values()}
     assert all(int(record["threads"]) >= 1 for record in two.values())
+
+
+@pytest.mark.parametrize(("device", "threads"), [(devices.CPU, str(max(num_cores() // 2, 1))), ("NVIDIA H200", None)])
+def test_workers_with_an_accelerator_compile_with_all_cores(monkeypatch, device: str, threads: str | None):
+    """XLA computes nothing on the cores there, and would compile for minutes with one thread."""
+    monkeypatch.setattr(devices, "list_devices", lambda: [devices.Device(device, {})])
+    monkeypatch.delenv("NPROC", raising=False)
+    results: dict[int, Record] = {}
+    evaluate_all(threads_of_xla, range(2), 2, results.__setitem__)
+    assert list(results.values()) == [{"threads": threads}] * 2
 
 
 def test_workers_look_for_no_window_system(monkeypatch):

@@ -1,6 +1,8 @@
 """Tests of the commands that count and measure: their tables, comparison with the ground truth, and figures."""
 
+import functools
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,11 @@ from phenotype_plots import run, table
 
 from jaxrl_vis import cli
 from jaxrl_vis.stalks.cli.options import PlantOptions
+from jaxrl_vis.stalks.phenotyping import pipeline
+from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
+from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import read_image
+from jaxrl_vis.stalks.phenotyping.pipeline import Request
 from jaxrl_vis_envs.plants import FAMILIES, shift
 
 
@@ -43,6 +49,23 @@ def test_several_processes_write_the_same(plots, results, tmp_path):
         (out / lost).unlink()
     assert run(plots, out, "--workers", "1") == 0
     assert all((out / path).read_bytes() == (results / path).read_bytes() for path in same)
+
+
+def sign(folder, image, pixels_per_metre, band, plot, pair):
+    (folder / f"{plot.name} {pair.name}").write_text(str(os.getpid()))
+    return []
+
+
+def test_this_process_compiles_for_its_workers(plots, tmp_path):
+    """It processes the first pair of all, and workers the others: each of them would compile the same by itself."""
+    there = find_plots(plots)
+    calibrations = {plot.name: read_calibration(plots / plot.name / "calibration.yaml") for plot in there}
+    request = Request(tmp_path / "out", "strip", "nobody", calibrations)
+    pipeline.run(there, functools.partial(sign, tmp_path), request, workers=2)
+    signed = {path.name: path.read_text() for path in tmp_path.glob("plot_*")}
+    assert len(signed) == 8
+    first = f"{there[0].name} {there[0].pairs[0].name}"
+    assert [pair for pair, process in signed.items() if process == str(os.getpid())] == [first]
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ Each process has one pair in memory at a time.
 
 import dataclasses
 import functools
+import itertools
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -153,6 +154,7 @@ def _run(
     stalks: list[Row] = []
     rows: list[Row] = []
     skipped: list[Row] = []
+    compiled = False
     for plot in plots:
         folder = request.out / "pairs" / file_name(plot.name)
         folder.mkdir(parents=True, exist_ok=True)
@@ -161,7 +163,11 @@ def _run(
         missing = [pair for pair in plot.pairs if not is_current(paths[pair.name], _sources(pair, calibration), _is_complete)]
         for number in range(1, len(plot.pairs) - len(missing) + 1):
             done(plot.name, number, len(plot.pairs))
-        made = run_all(functools.partial(_pair_record, plot, find, request), missing)
+        make_record = functools.partial(_pair_record, plot, find, request)
+        # This process compiles for all with the first pair; each worker would compile the same with a fraction of the cores.
+        alone = 0 if compiled else 1
+        made = itertools.chain(map(make_record, missing[:alone]), run_all(make_record, missing[alone:]))
+        compiled = compiled or bool(missing)
         for number, (name, record, sources) in enumerate(made, start=1):
             write_record(paths[name], record, sources)
             done(plot.name, len(plot.pairs) - len(missing) + number, len(plot.pairs))
