@@ -34,8 +34,8 @@ Record = dict[str, Any]
 A = TypeVar("A")
 T = TypeVar("T")
 
-# Variables that limit the threads of NumPy, SciPy and OpenCV in a process, and those of XLA.
-_THREADS, _XLA_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "NPROC"
+# Variables that limit the threads of NumPy, SciPy, OpenCV and, last, XLA in a process.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC")
 _CHECK_INTERVAL = 1.0  # s without a result after which workers that ended are looked for
 
 
@@ -166,7 +166,7 @@ def _worker_env_vars(workers: int) -> list[dict[str, str]]:
 
     devices = list_devices()
     # With an accelerator, XLA needs its threads only to compile: for minutes with one, for seconds with many.
-    limited = (*_THREADS, _XLA_THREADS) if devices[0].name == CPU else _THREADS
+    limited = _THREADS if devices[0].name == CPU else _THREADS[:-1]
     threads = dict.fromkeys(limited, str(max(num_cores() // workers, 1)))
     # Workers open no window; otherwise importing MuJoCo would start a process that looks for GLFW and outlives the worker.
     share = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", "MUJOCO_GL": os.environ.get("MUJOCO_GL", "disable")}

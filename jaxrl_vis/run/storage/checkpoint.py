@@ -399,9 +399,7 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         try:
-            manager = self._manager(tier)  # first, because `silenced` restores the hooks that it finds
-            with silencing.silenced():
-                return manager.restore(iteration, args=ocp.args.Composite(**arguments))
+            return self._manager(tier).restore(iteration, args=ocp.args.Composite(**arguments))
         # orbax and tensorstore report damage by arbitrary exceptions, plain Exception included.
         except Exception as error:
             self._unsilence = lambda: None  # as after a failed write: threads of this read may report errors later

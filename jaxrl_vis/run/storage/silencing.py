@@ -1,23 +1,10 @@
 """Silencing of orbax and tensorstore, which log long messages about errors that they also raise, even from their threads."""
 
-import contextlib
 import logging
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
-
-
-@contextlib.contextmanager
-def silenced() -> Iterator[None]:
-    """Suppress orbax's output about a checkpoint whose error will be reported in one line."""
-    absl, before = logging.getLogger("absl"), sys.unraisablehook
-    disabled = absl.disabled
-    absl.disabled, sys.unraisablehook = True, lambda _: None
-    try:
-        yield
-    finally:
-        absl.disabled, sys.unraisablehook = disabled, before
 
 
 def silence_orbax() -> Callable[[], None]:

@@ -3,9 +3,7 @@
 import dataclasses
 
 from jaxrl_vis.cli.checks import check_counts
-from jaxrl_vis.host.devices import check_devices
-from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.stalks.cli.options import SynthOptions, check_extra
+from jaxrl_vis.stalks.cli.options import SynthOptions
 from jaxrl_vis.stalks.cli.phenotype_synth import write_synthetic
 
 
@@ -24,10 +22,5 @@ def synth(options: Synth) -> int:
         RequestError: An option is invalid, a package is missing, no device works, or the folder cannot be written to.
     """
     check_counts(runs=options.runs)
-    options.check()
-    check_extra("grasping")
-    check_writable(options.out, "--out", folder=True)
-    family = options.read_family("grasping")
-    check_devices()
-    write_synthetic(options, family, options.runs, "all", "runs")
+    write_synthetic(options, "grasping", options.runs, "all", "runs")
     return 0

@@ -1,17 +1,14 @@
 """``jaxrl-vis phenotype synth``: write synthetic plots."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from jaxrl_vis.cli.checks import check_counts
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.stalks.cli.options import SynthOptions, check_extra
+from jaxrl_vis.stalks.cli.options import Purpose, SynthOptions, check_extra
 from jaxrl_vis.stalks.cli.progress import progress
-
-if TYPE_CHECKING:
-    from jaxrl_vis_envs.plants import Family
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,30 +29,35 @@ def synth(options: Synth) -> int:
         RequestError: An option is invalid, a package is missing, no device works, or the folder cannot be written to.
     """
     check_counts(plots=options.plots)
-    options.check()
-    check_extra("phenotyping")
-    check_writable(options.out, "--out", folder=True)
-    family = options.read_family("phenotyping")
-    check_devices()
-    write_synthetic(options, family, options.plots, options.truth, "plots")
+    write_synthetic(options, "phenotyping", options.plots, options.truth, "plots")
     return 0
 
 
 def write_synthetic(
-    options: SynthOptions, family: "Family", count: int, truth: Literal["all", "boxes", "none"], unit: str
+    options: SynthOptions,
+    purpose: Purpose,
+    count: int,
+    truth: Literal["all", "boxes", "none"],
+    unit: str,
 ) -> None:
     """Write plots or runs with progress, and print a one-line summary.
 
     Args:
-        options: Folder, image format and first seed.
-        family: Family that the plots are sampled from.
+        options: Family, folder, image format and first seed.
+        purpose: Extra whose packages are needed, and purpose of the family.
         count: Number of plots.
         truth: Ground truth to write.
         unit: Noun for the plots in the summary, in the plural.
 
     Raises:
-        RequestError: The folder cannot be written to, or holds another family's plots.
+        RequestError: An option is invalid, a package is missing, no device works, or the folder cannot be written to, or holds
+            another family's plots.
     """
+    options.check()
+    check_extra(purpose)
+    check_writable(options.out, "--out", folder=True)
+    family = options.read_family(purpose)
+    check_devices()
     from jaxrl_vis.stalks.phenotyping.evaluation.synth import plot_name, write_plots
 
     seeds = range(options.seed, options.seed + count)

@@ -154,7 +154,8 @@ def _run(
     stalks: list[Row] = []
     rows: list[Row] = []
     skipped: list[Row] = []
-    compiled = False
+    # This process compiles for all with the first pair; each worker would compile the same with a fraction of the cores.
+    alone = 1
     for plot in plots:
         folder = request.out / "pairs" / file_name(plot.name)
         folder.mkdir(parents=True, exist_ok=True)
@@ -164,10 +165,8 @@ def _run(
         for number in range(1, len(plot.pairs) - len(missing) + 1):
             done(plot.name, number, len(plot.pairs))
         make_record = functools.partial(_pair_record, plot, find, request)
-        # This process compiles for all with the first pair; each worker would compile the same with a fraction of the cores.
-        alone = 0 if compiled else 1
         made = itertools.chain(map(make_record, missing[:alone]), run_all(make_record, missing[alone:]))
-        compiled = compiled or bool(missing)
+        alone = 0 if missing else alone
         for number, (name, record, sources) in enumerate(made, start=1):
             write_record(paths[name], record, sources)
             done(plot.name, len(plot.pairs) - len(missing) + number, len(plot.pairs))
