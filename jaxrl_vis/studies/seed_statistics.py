@@ -21,12 +21,11 @@ def interquartile_mean(scores: Sequence[np.ndarray]) -> float:
     return float(scipy.stats.trim_mean(np.concatenate(scores), 0.25))
 
 
-def bootstrap_interval(scores: Sequence[np.ndarray], level: float = 0.95, seed: int = 0) -> tuple[float, float]:
-    """Compute a percentile interval of the interquartile mean; seeds are resampled within their task.
+def bootstrap_interval(scores: Sequence[np.ndarray], seed: int = 0) -> tuple[float, float]:
+    """Compute a 95 % percentile interval of the interquartile mean; seeds are resampled within their task.
 
     Args:
         scores: One array of scores per task, [S].
-        level: Coverage of the interval.
         seed: Seed of the resampling.
 
     Returns:
@@ -35,5 +34,5 @@ def bootstrap_interval(scores: Sequence[np.ndarray], level: float = 0.95, seed: 
     random = np.random.default_rng(seed)
     samples = [values[random.integers(len(values), size=(RESAMPLES, len(values)))] for values in map(np.asarray, scores)]
     means = scipy.stats.trim_mean(np.concatenate(samples, axis=1), 0.25, axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    low, high = np.quantile(means, [0.025, 0.975])
     return float(low), float(high)

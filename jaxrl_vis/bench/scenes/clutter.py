@@ -13,14 +13,9 @@ _CAMERAS = {"front": (1.8, 0.0, 1.2), "left": (-0.5, 1.7, 1.0), "right": (-0.6, 
 _TARGET = (0.0, 0.0, 0.2)
 
 
-def clutter_spec(seed: int = 0, instances: int = INSTANCES) -> mujoco.MjSpec:
-    """Build the scene: free bodies in loose layers over a floor, in random orientations and colours.
-
-    Args:
-        seed: Seed of shapes, orientations and colours.
-        instances: Number of bodies.
-    """
-    rng = np.random.default_rng(seed)
+def clutter_spec() -> mujoco.MjSpec:
+    """Build the scene: free bodies in loose layers over a floor, in random orientations and colours."""
+    rng = np.random.default_rng(0)
     spec = mujoco.MjSpec()
     spec.modelname = "clutter"
     spec.stat.extent, spec.stat.center = 2.0, np.array(_TARGET)
@@ -39,7 +34,7 @@ def clutter_spec(seed: int = 0, instances: int = INSTANCES) -> mujoco.MjSpec:
         points, faces = mesh(number, rng)
         spec.add_mesh(name=f"mesh{number}", uservert=points.ravel(), userface=faces.ravel())
     shift = -0.5 * (np.array(_GRID) - 1) * _SPACING * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.08]
-    for index in range(instances):
+    for index in range(INSTANCES):
         cell = np.array(np.unravel_index(index % np.prod(_GRID), _GRID))
         turn = rng.normal(size=4)
         body = world.add_body(pos=cell * _SPACING + shift, quat=turn / np.linalg.norm(turn))

@@ -174,13 +174,12 @@ class Score:
         )
 
 
-def wilson_interval(count: int, total: int, z: float = 1.959964) -> tuple[float, float]:
-    """Return the Wilson score interval of a proportion ``count / total``; (NaN, NaN) if ``total`` is 0.
+def wilson_interval(count: int, total: int) -> tuple[float, float]:
+    """Return the 95 % Wilson score interval of a proportion ``count / total``; (NaN, NaN) if ``total`` is 0.
 
     Args:
         count: Number of hits.
         total: Total number.
-        z: Quantile of the standard normal distribution; the default gives 95 % coverage.
 
     Raises:
         ValueError: ``count`` is not from 0 to ``total``.
@@ -189,6 +188,7 @@ def wilson_interval(count: int, total: int, z: float = 1.959964) -> tuple[float,
         raise ValueError(f"a count must be from 0 to what it is of, got {count} of {total}")
     if not total:
         return math.nan, math.nan
+    z = 1.959964  # quantile of the standard normal distribution
     value, square = count / total, z * z / total
     middle = (value + square / 2) / (1 + square)
     half = z / (1 + square) * math.sqrt(value * (1 - value) / total + square / (4 * total))

@@ -87,15 +87,12 @@ class _Line(NamedTuple):
     shown: int
 
 
-def detect_grasp_points(
-    segments: StalkSegments, visibility: Visibility, heights: tuple[float, float] = HEIGHTS
-) -> list[GraspPoint]:
+def detect_grasp_points(segments: StalkSegments, visibility: Visibility) -> list[GraspPoint]:
     """Detect stalks and return their grasp points, in ascending order of x.
 
     Args:
         segments: Segments of all pairs, in the robot frame of the last one.
         visibility: Visibility of points in all pairs.
-        heights: Minimum and maximum height of a grasp, m above the ground.
     """
     free = np.ones(len(segments), bool)
     lines: list[_Line] = []
@@ -107,7 +104,7 @@ def detect_grasp_points(
         if not len(members):
             continue
         free[members] = False
-        point = _make_grasp_point(segments, members, min(2, len(visibility.clouds)), heights)
+        point = _make_grasp_point(segments, members, min(2, len(visibility.clouds)))
         if point is None:
             continue
         count = _count_support(point, visibility)
@@ -191,15 +188,13 @@ def _support(segments: StalkSegments, members: np.ndarray) -> tuple[float, int]:
     return _BIN * len(occupied), int((counts >= 2).sum())
 
 
-def _make_grasp_point(
-    segments: StalkSegments, members: np.ndarray, min_frames: int, heights: tuple[float, float]
-) -> GraspPoint | None:
+def _make_grasp_point(segments: StalkSegments, members: np.ndarray, min_frames: int) -> GraspPoint | None:
     """Return the grasp point of a stalk; None if the pairs show too little of it, or fewer than ``min_frames`` show it."""
     length, frames = _support(segments, members)
     if length < _MIN_SUPPORT or frames < min_frames:
         return None
     points = segments.middle[members]
-    places = np.arange(heights[0], heights[1] + 1e-9, _BIN)
+    places = np.arange(HEIGHTS[0], HEIGHTS[1] + 1e-9, _BIN)
     within = np.abs(points[None, :, 2] - places[:, None]) < _WINDOW
     count = within.sum(axis=1) * np.exp(-0.5 * ((places - PREFERRED) / 0.3) ** 2)
     best = int(np.argmax(count))

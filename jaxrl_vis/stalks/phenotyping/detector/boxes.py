@@ -7,6 +7,8 @@ outputs of torchvision.ops, recorded in tests/stalks/data/torchvision_boxes.npz 
 import jax
 import jax.numpy as jnp
 
+_SAMPLES = 2  # sampling points per grid cell of a region and direction, which are averaged
+
 
 def area(boxes: jax.Array) -> jax.Array:
     """Compute the areas [...] of boxes [..., 4]; 0 for inverted boxes."""
@@ -142,7 +144,7 @@ def roi_align(
     return jnp.einsum("nijw,niwc->nijc", columns, tall)
 
 
-def roi_rows(features: jax.Array, top: jax.Array, bottom: jax.Array, cells: int, scale: float, samples: int = 2) -> jax.Array:
+def roi_rows(features: jax.Array, top: jax.Array, bottom: jax.Array, cells: int, scale: float) -> jax.Array:
     """Interpolate the rows of regions that span the whole width, the first half of `roi_align` with ``aligned``.
 
     Args:
@@ -150,18 +152,17 @@ def roi_rows(features: jax.Array, top: jax.Array, bottom: jax.Array, cells: int,
         top, bottom: First and last rows [B] of the regions, in box coordinates.
         cells: Number of rows of the grid.
         scale: Factor from box coordinates to feature coordinates.
-        samples: Sampling points per grid cell, which are averaged.
 
     Returns:
         Features [B, cells, W, C] of the rows.
     """
-    fraction = (jnp.arange(cells * samples) + 0.5) / (cells * samples)
+    fraction = (jnp.arange(cells * _SAMPLES) + 0.5) / (cells * _SAMPLES)
     low, high = top * scale - 0.5, bottom * scale - 0.5
     place = low[:, None] + (high - low)[:, None] * fraction
     inside = (place >= -1.0) & (place <= features.shape[0])
     place = jnp.clip(place, 0.0, features.shape[0] - 1.0)
     weight = jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.arange(features.shape[0])), 0.0) * inside[..., None]
-    return jnp.einsum("bih,hwc->biwc", weight.reshape(len(top), cells, samples, -1).mean(axis=2), features)
+    return jnp.einsum("bih,hwc->biwc", weight.reshape(len(top), cells, _SAMPLES, -1).mean(axis=2), features)
 
 
 def roi_columns(
@@ -172,7 +173,6 @@ def roi_columns(
     lean: jax.Array,
     cells: int,
     scale: float,
-    samples: int = 2,
 ) -> jax.Array:
     """Pool rows of `roi_rows` to the grids of regions, the second half of `roi_align`.
 
@@ -183,13 +183,12 @@ def roi_columns(
         lean: [N], horizontal shift of the bottom of a region relative to its top.
         cells: Number of columns of the grid.
         scale: Factor from box coordinates to feature coordinates.
-        samples: Sampling points per grid cell, which are averaged.
 
     Returns:
         Pooled features [N, h, cells, C].
     """
     _, height, width, channels = rows.shape
-    fraction = (jnp.arange(cells * samples) + 0.5) / (cells * samples)
+    fraction = (jnp.arange(cells * _SAMPLES) + 0.5) / (cells * _SAMPLES)
     moved = (lean * scale)[:, None] * ((jnp.arange(height) + 0.5) / height - 0.5)
     place = (left * scale - 0.5)[:, None, None] + moved[..., None] + ((right - left) * scale)[:, None, None] * fraction
     inside = (place >= -1.0) & (place <= width)
@@ -199,4 +198,4 @@ def roi_columns(
     row = jnp.arange(height)[None, :, None]
     band = of_region[:, None, None]
     values = rows[band, row, first] * (1.0 - part) + rows[band, row, jnp.minimum(first + 1, width - 1)] * part
-    return (values * inside[..., None]).reshape(-1, height, cells, samples, channels).mean(axis=3)
+    return (values * inside[..., None]).reshape(-1, height, cells, _SAMPLES, channels).mean(axis=3)

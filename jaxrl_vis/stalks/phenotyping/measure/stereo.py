@@ -22,6 +22,8 @@ from jaxrl_vis.stalks.phenotyping.measure.width import index_pairs, median
 _MIN_SCORE = 0.5
 _AGREEING = 0.4
 _SCATTER = 1.0  # pixels: maximum scatter of the disparities of one stalk
+_CORE = 0.7  # central fraction of a stalk's width that is matched: towards its edges a stalk is further away
+_SPREAD = 2  # rows: tolerance for vertical misalignment of the right image, up or down
 _COARSE_WINDOWS = 6  # windows of a stalk that are searched over all disparities
 _BESIDE = 12  # pixels: search range of the other windows around the disparity expected from the first ones
 _MAX_PEAK_RATIO = 0.97  # maximum ratio of the second to the first peak; above, a window is ambiguous
@@ -80,8 +82,6 @@ def match_rows(
     edges: tuple[np.ndarray, np.ndarray],
     bounds: tuple[float, float],
     half_height: int = 8,
-    core: float = 0.7,
-    spread: int = 2,
 ) -> StalkDisparity:
     """Match windows along a stalk with known edges.
 
@@ -91,8 +91,6 @@ def match_rows(
         edges: Columns [N] of the stalk's left and right edge in each of these rows.
         bounds: Minimum and maximum disparity, pixels.
         half_height: Rows of a window above and below its centre row.
-        core: Central fraction of the stalk's width that a window spans: towards its edges a stalk is further away.
-        spread: Tolerance for vertical misalignment of the right image, rows up or down.
 
     Returns:
         Disparities of the windows with a unique match, in the order of ``rows``. Windows outside the image or narrower than
@@ -101,16 +99,16 @@ def match_rows(
     wanted = [
         _Window(
             row,
-            int(np.ceil(begin + 0.5 * (1.0 - core) * (end - begin))),
-            int(np.floor(end - 0.5 * (1.0 - core) * (end - begin))) + 1,
+            int(np.ceil(begin + 0.5 * (1.0 - _CORE) * (end - begin))),
+            int(np.floor(end - 0.5 * (1.0 - _CORE) * (end - begin))) + 1,
         )
         for row, begin, end in zip(np.asarray(rows, int), *edges)
     ]
-    wanted = [strip for strip in wanted if strip.is_inside(left.shape, half_height, spread)]
+    wanted = [strip for strip in wanted if strip.is_inside(left.shape, half_height)]
     # A few windows are searched over all disparities. If these agree, the others are searched near the expected disparity.
     first = sorted(set(np.linspace(0, len(wanted) - 1, min(_COARSE_WINDOWS, len(wanted))).round().astype(int)))
     limits = int(np.floor(bounds[0])), int(np.ceil(bounds[1]))
-    matches = {place: _match_window(left, right, wanted[place], limits, half_height, spread) for place in first}
+    matches = {place: _match_window(left, right, wanted[place], limits, half_height) for place in first}
     expected = _robust_line([(wanted[place].row, result[0]) for place, result in matches.items() if result is not None])
     for place, window in enumerate(wanted):
         if place in matches:
@@ -119,7 +117,7 @@ def match_rows(
         if expected is not None:
             middle = expected[0] + expected[1] * window.row
             within = max(math.floor(middle) - _BESIDE, limits[0]), min(math.ceil(middle) + _BESIDE, limits[1])
-        matches[place] = _match_window(left, right, window, within, half_height, spread) if within[0] < within[1] else None
+        matches[place] = _match_window(left, right, window, within, half_height) if within[0] < within[1] else None
     values = [(float(wanted[place].row), *result) for place, result in sorted(matches.items()) if result is not None]
     matched = np.array(values, float).reshape(-1, 3)
     return StalkDisparity(matched[:, 0], matched[:, 1], matched[:, 2], len(rows))
@@ -138,21 +136,20 @@ class _Window:
     first: int
     last: int
 
-    def is_inside(self, shape: tuple[int, ...], half_height: int, spread: int) -> bool:
+    def is_inside(self, shape: tuple[int, ...], half_height: int) -> bool:
         """Return True if the window is at least 6 pixels wide and, with the margin for vertical misalignment, in the image.
 
         Args:
             shape: Height and width of the image.
             half_height: Rows of the window above and below its centre.
-            spread: Maximum vertical misalignment, rows.
         """
-        reach = half_height + spread
+        reach = half_height + _SPREAD
         tall = reach <= self.row and self.row + reach + 1 <= shape[0]
         return tall and self.last - self.first >= 6 and self.first >= 0 and self.last <= shape[1]
 
 
 def _match_window(
-    left: np.ndarray, right: np.ndarray, window: _Window, bounds: tuple[int, int], half_height: int, spread: int
+    left: np.ndarray, right: np.ndarray, window: _Window, bounds: tuple[int, int], half_height: int
 ) -> tuple[float, float] | None:
     """Return the disparity (pixels) and correlation of a window; None without a match in the bounds, or if it is ambiguous.
 
@@ -161,14 +158,13 @@ def _match_window(
         window: Window of the left image.
         bounds: Minimum and maximum disparity, pixels.
         half_height: Rows of the window above and below its centre.
-        spread: Maximum vertical misalignment, rows.
     """
     top, bottom = window.row - half_height, window.row + half_height + 1
     begin, end = max(window.first - bounds[1] - 1, 0), min(window.last - bounds[0] + 1, right.shape[1])
     if end - begin < window.last - window.first + 2:
         return None
     piece = np.ascontiguousarray(left[top:bottom, window.first : window.last])
-    searched = np.ascontiguousarray(right[top - spread : bottom + spread, begin:end])
+    searched = np.ascontiguousarray(right[top - _SPREAD : bottom + _SPREAD, begin:end])
     best = _subpixel_peak(cv2.matchTemplate(searched, piece, cv2.TM_CCOEFF_NORMED))
     return None if best is None else (window.first - (begin + best[0]), best[1])
 
@@ -193,7 +189,6 @@ def sample_rows(
     rows: np.ndarray,
     edges: tuple[np.ndarray, np.ndarray],
     bounds: tuple[float, float],
-    core: float = 0.7,
 ) -> StalkDisparity:
     """Sample the disparities of a stalk with known edges from a disparity image: the median across the stalk in each row.
 
@@ -204,11 +199,10 @@ def sample_rows(
         rows: Integer image rows [N].
         edges: Columns [N] of the stalk's left and right edge in each of these rows.
         bounds: Minimum and maximum disparity, pixels.
-        core: Central fraction of the stalk's width that is used.
     """
     samples = []
     for row, begin, end in zip(np.asarray(rows, int), *edges):
-        margin = 0.5 * (1.0 - core) * (end - begin)
+        margin = 0.5 * (1.0 - _CORE) * (end - begin)
         first, last = max(int(np.ceil(begin + margin)), 0), int(np.floor(end - margin)) + 1
         if not 0 <= row < disparity.shape[0] or last <= first:
             continue

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 _MIN_ROWS = 8
+_MIN_INSIDE = 0.5  # minimum value of a stalk's pixels in its mask
 _CONVERGED = 1e-3  # change of weights below which the robust fit has converged
 _MAX_EDGE_OFFSET = 0.12  # of the width: maximum distance of a local edge from the edge fitted to the whole stalk
 _OUTLIER_DISTANCE = 1.5  # pixels: maximum distance of an edge from the mode of its neighbours
@@ -71,19 +72,18 @@ class Strip:
         return self.used * enough / (1.0 + (self.residual / 1.5) ** 2)
 
 
-def row_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def row_edges(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the left and right edge of the longest run in each row of a mask.
 
     Args:
         mask: [H, W] bool, or float32 from 0 to 1 for subpixel precision.
-        threshold: Minimum value of the stalk's pixels.
 
     Returns:
         Rows [N] int64, and the columns of their left and right edges [N] float64. Rows in which the longest run touches the
         left or right side of the mask are omitted: the stalk may extend beyond it.
     """
     soft = np.asarray(mask, np.float32)
-    inside = soft >= threshold
+    inside = soft >= _MIN_INSIDE
     padded = np.zeros((inside.shape[0], inside.shape[1] + 2), np.int8)
     padded[:, 1:-1] = inside
     change = np.diff(padded, axis=1)
@@ -101,12 +101,12 @@ def row_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np.
     def crossing(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
         """Return the position between the inner and the outer pixel at which the mask crosses the threshold, 0 to 1."""
         out, within = soft[row, outer], soft[row, inner]
-        return np.where(within > out, (within - threshold) / np.maximum(within - out, 1e-6), 0.5)
+        return np.where(within > out, (within - _MIN_INSIDE) / np.maximum(within - out, 1e-6), 0.5)
 
     return row, start - crossing(start - 1, start), end - 1 + crossing(end, end - 1)
 
 
-def fit_strip(mask: np.ndarray, threshold: float = 0.5) -> Strip | None:
+def fit_strip(mask: np.ndarray) -> Strip | None:
     """Fit two straight lines to the edges of a stalk's mask.
 
     Rows in which the stalk is partially occluded, swollen by a node, or cut off by the end of the strip are rejected as
@@ -115,12 +115,11 @@ def fit_strip(mask: np.ndarray, threshold: float = 0.5) -> Strip | None:
 
     Args:
         mask: Mask [H, W] of one stalk or a segment of it, more upright than horizontal; bool, or float32 from 0 to 1.
-        threshold: Minimum value of the stalk's pixels.
 
     Returns:
         Fitted strip; None if there are fewer than eight inlier rows.
     """
-    return fit_edges(*row_edges(mask, threshold))
+    return fit_edges(*row_edges(mask))
 
 
 def fit_strip_near(strip: Strip, row: float, reach: float, height: int) -> Strip | None:
