@@ -84,15 +84,16 @@ def install_command(extra: str) -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of `PACKAGES`; `NOT_INSTALLED` for missing ones."""
-    return {"python": platform.python_version()} | {package: _installed_version(package) for package in PACKAGES}
+    installed = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            installed[package] = _installed_version(package)
+        except importlib.metadata.PackageNotFoundError:
+            installed[package] = NOT_INSTALLED
+    return installed
 
 
-@functools.cache
-def _installed_version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return NOT_INSTALLED
+_installed_version = functools.cache(importlib.metadata.version)  # a missing package is looked for again
 
 
 def device_record() -> dict[str, Any]:

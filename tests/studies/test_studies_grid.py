@@ -55,7 +55,7 @@ for number in range(done + 1, -(-steps // 100) + 1):
         time.sleep(60)
     if behaviour == "ends early":
         break
-time.sleep(0.1)
+time.sleep(0.3)
 """
 
 
@@ -140,7 +140,7 @@ def test_every_device_has_one_process_at_a_time(tmp_path: Path) -> None:
     assert {device for (device,), _ in order} == {"3", "5"}
     for one in ("3", "5"):
         starts = [at for (device,), at in order if device == one]
-        assert len(starts) >= 2 and all(later - before > 0.09 for before, later in zip(starts, starts[1:]))
+        assert len(starts) >= 2 and all(later - before > 0.29 for before, later in zip(starts, starts[1:]))
     first = sorted(at for _, at in order)[:2]
     assert first[1] - first[0] < 0.29  # side by side
 

@@ -16,7 +16,7 @@ def silence_orbax() -> Callable[[], None]:
     def is_not_abandoned(record: logging.LogRecord) -> bool:
         # Of several reads that fail, orbax raises the first error; the event loop reports the others when they are deleted.
         text = record.getMessage()
-        return "exception was never retrieved" not in text or not ("orbax" in text or "driver" in text)
+        return "exception was never retrieved" not in text or not ("orbax" in text or 'Error opening "' in text)
 
     def hook(unraisable: Any) -> None:
         # From other threads this is tensorstore, notifying an event loop that has failed and no longer exists.

@@ -102,7 +102,8 @@ def run(
         find: Stalk detector; must be picklable if there is more than one worker.
         request: Options of the run.
         done: Progress callback, called after each pair with the plot's name, and the numbers of finished and of all its pairs.
-        workers: Number of processes that measure pairs and render overlays; 1 to use the calling process.
+        workers: Number of processes that measure pairs and render overlays, except for the first pair; 1 to use the calling
+            process.
         echo: Callback for each plot without a count, with its name and the reason.
 
     Returns:
@@ -154,8 +155,8 @@ def _run(
     stalks: list[Row] = []
     rows: list[Row] = []
     skipped: list[Row] = []
-    # This process compiles for all with the first pair; each worker would compile the same with a fraction of the cores.
-    alone = 1
+    # The first pair is processed here, which compiles for all: each worker would compile the same with a fraction of the cores.
+    here = 1
     for plot in plots:
         folder = request.out / "pairs" / file_name(plot.name)
         folder.mkdir(parents=True, exist_ok=True)
@@ -165,8 +166,8 @@ def _run(
         for number in range(1, len(plot.pairs) - len(missing) + 1):
             done(plot.name, number, len(plot.pairs))
         make_record = functools.partial(_pair_record, plot, find, request)
-        made = itertools.chain(map(make_record, missing[:alone]), run_all(make_record, missing[alone:]))
-        alone = 0 if missing else alone
+        made = itertools.chain(map(make_record, missing[:here]), run_all(make_record, missing[here:]))
+        here = 0 if missing else here
         for number, (name, record, sources) in enumerate(made, start=1):
             write_record(paths[name], record, sources)
             done(plot.name, len(plot.pairs) - len(missing) + number, len(plot.pairs))
