@@ -16,6 +16,8 @@ from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import read_image
 from jaxrl_vis.stalks.phenotyping.pipeline import Request
+from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 from jaxrl_vis_envs.plants import FAMILIES, shift
 
 
@@ -49,6 +51,17 @@ def test_several_processes_write_the_same(plots, results, tmp_path):
         (out / lost).unlink()
     assert run(plots, out, "--workers", "1") == 0
     assert all((out / path).read_bytes() == (results / path).read_bytes() for path in same)
+
+
+@pytest.mark.parametrize("top", [-80.0, -3.0, 2.0, 150.0])
+def test_labels_stay_in_the_image_and_darken_their_own_place_only(top):
+    """A photograph may show a part of a stalk whose box begins above or below the image."""
+    image = np.full((120, 200, 3), 100, np.uint8)
+    plain = draw_overlay(image, [], [])
+    sighting = Sighting((95.0, top, 105.0, top + 90.0), (100.0, 100.0), 0.9, top + 45.0, 100.0)
+    changed = (draw_overlay(image, [sighting], [None]).astype(int) - plain).min(axis=-1) <= -40  # darkened, lines apart
+    rows = np.flatnonzero(changed.sum(axis=1) > 15)
+    assert 5 <= len(rows) <= 25 and np.ptp(rows) < 25
 
 
 def sign(folder, image, pixels_per_metre, band, plot, pair):

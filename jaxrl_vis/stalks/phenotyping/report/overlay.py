@@ -88,7 +88,7 @@ class _LabelWriter:
         """Write text above a point (column, row), as close as there is free space, with a line down to the point."""
         wide, tall = self._size(text)
         left = min(max(point[0] - wide // 2, 0), max(self._canvas.shape[1] - wide, 0))
-        bottom = point[1] - tall // 2
+        bottom = min(max(point[1] - tall // 2, tall), self._canvas.shape[0])  # a box may reach beyond the image
         while bottom > 2 * tall and any(_do_overlap((left, bottom - tall, left + wide, bottom), box) for box in self._taken):
             bottom -= tall // 3
         cv2.line(self._canvas, (point[0], bottom), point, colour, 1, cv2.LINE_AA)
