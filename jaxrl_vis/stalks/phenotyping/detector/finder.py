@@ -193,11 +193,12 @@ class Finder:
         if pixels_per_metre is None and self._substitute is not None:
             return self._substitute(image, None, band)
         frame = find_frame(image)
-        detections = self._find(fill_borders(image, frame), pixels_per_metre, frame, band)
+        part = fill_borders(image, frame)
+        detections = self._find(part, pixels_per_metre, frame, band)
         if self._substitute is not None and _is_doubtful(detections):
             # The doubt remains that of the first networks: how accurate their substitutes are there is not well known.
-            others = self._substitute(image, pixels_per_metre, band)
-            return Detections(others, detections.doubt, detections.max_doubt)
+            others = self._substitute._find(part, pixels_per_metre, frame, band)
+            detections = Detections(others, detections.doubt, detections.max_doubt)
         ordered = sorted(detections, key=lambda detection: sum(detection.axis))
         in_full_image = (_to_full_image(detection, frame) for detection in ordered)
         return Detections(in_full_image, detections.doubt, detections.max_doubt)

@@ -93,9 +93,12 @@ def _border_width(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
         dark: [H, W] bool, True where all channels are dark.
         image: [H, W, 3] or [H, W] uint8.
     """
-    if np.count_nonzero(dark[:, 0]) < _MIN_LENGTH * dark.shape[0]:
+    beside = np.flatnonzero(dark[:, 0])
+    if beside.size < _MIN_LENGTH * dark.shape[0]:
         return None
-    depth = np.where(dark.all(axis=1), 0, np.argmin(dark, axis=1))
+    rows = dark[beside]
+    depth = np.zeros(dark.shape[0], int)
+    depth[beside] = np.where(rows.all(axis=1), 0, rows.argmin(axis=1))
     there = np.flatnonzero(depth > _WIDENING)
     if there.size < max(_MIN_LENGTH * dark.shape[0], _RINGING):
         return None
@@ -132,15 +135,14 @@ def fill_borders(image: np.ndarray, frame: Frame) -> np.ndarray:
     part = image[slice(*frame.rows), slice(*frame.columns)]
     if frame.shown is None:
         return part
-    shown = frame.shown[slice(*frame.rows), slice(*frame.columns)]
-    # Each border pixel gets the value of the nearest pixel of the scene.
-    _, labels = cv2.distanceTransformWithLabels((~shown).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
-    labels = labels.astype(np.int64)
-    row, column = np.nonzero(shown)
-    sources = np.zeros((int(labels.max()) + 1, 2), np.int64)
-    sources[labels[row, column]] = np.stack([row, column], axis=1)
-    hidden = np.nonzero(~shown)
-    nearest = sources[labels[hidden]]
+    hidden = (~frame.shown[slice(*frame.rows), slice(*frame.columns)]).astype(np.uint8)
+    # Each border pixel gets the value of the nearest pixel of the scene, which is beside the border.
+    _, nearest = cv2.distanceTransformWithLabels(hidden, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    labels = np.asarray(nearest, np.int32).ravel()
+    beside, inside = np.flatnonzero(cv2.dilate(hidden, np.ones((3, 3))) > hidden), np.flatnonzero(hidden)
+    sources = np.zeros(int(labels.max()) + 1, int)
+    sources[labels[beside]] = beside
     filled = part.copy()
-    filled[hidden] = part[nearest[:, 0], nearest[:, 1]]
+    pixels = filled.reshape(-1, filled.shape[-1])
+    pixels[inside] = pixels[sources[labels[inside]]]
     return filled

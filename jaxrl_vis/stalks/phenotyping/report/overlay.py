@@ -11,6 +11,7 @@ from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 COUNTED, REJECTED, MEASURED = (70, 235, 100), (255, 105, 75), (255, 225, 60)
 """RGB colours: outlines of counted and of rejected detections, and marks where widths were measured."""
 _MAX_WIDTH = 1688
+_BRIGHTENED = np.round(255.0 * (np.arange(256) / 255.0) ** 0.7).astype(np.uint8)
 _LEGEND = (("counted", COUNTED), ("not counted", REJECTED), ("width was taken here", MEASURED))
 
 
@@ -31,7 +32,7 @@ def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str 
     scale = overlay_scale(image.shape[1])
     size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    canvas = np.round(255.0 * (small / 255.0) ** 0.7).astype(np.uint8)
+    canvas = cv2.LUT(small, _BRIGHTENED)
     thickness = max(round(size[0] / 800), 1)
     for sighting, label in zip(sightings, labels):
         _draw_outline(canvas, sighting, COUNTED if label is not None else REJECTED, scale, thickness)
