@@ -28,7 +28,7 @@ from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError
 from jaxrl_vis.host import distributed
 from jaxrl_vis.host.streams import reserve_standard_files, safe_streams
 from jaxrl_vis.run import resume_checks, trust
-from jaxrl_vis.run.compiled.memory import check_compiled, check_memory, fit_together
+from jaxrl_vis.run.compiled.memory import check_compiled, check_memory
 from jaxrl_vis.run.compiled.pending import PendingMetrics
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.goodput import Goodput
@@ -215,8 +215,7 @@ class RunLoop:
         """Check the memory again, the last check that can refuse the run; then prepare folder and state."""
         self._echo(f"compiled in {format_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
-        check_compiled(compiled, is_there, layout)
-        has_room = not distributed.any_process(not fit_together(compiled, is_there, layout))  # and all have come here
+        has_room = not distributed.any_process(not check_compiled(compiled, is_there, layout))  # and all have come here
         self._evaluates_ahead = self._programs.evaluates_ahead and has_room
         if self._writes:
             self._open(is_resumed, overwrite)

@@ -77,10 +77,9 @@ def test_an_evaluation_begins_early_only_where_there_is_room(straight, tmp_path,
     assert largest < all_of_them
     for there, fits in ((largest, False), (all_of_them - 1, False), (all_of_them, True)):
         monkeypatch.setattr(memory, "available_bytes", lambda there=there: there)
-        memory.check_compiled(compiled, is_allocated=False)
-        assert memory.fit_together(compiled, is_allocated=False) is fits
+        assert memory.check_compiled(compiled, is_allocated=False) is fits
     monkeypatch.undo()
-    monkeypatch.setattr(run_loop, "fit_together", lambda *_: False)
+    monkeypatch.setattr(run_loop, "check_compiled", lambda *_: False)
     list(make_fake_trainer(read_config(run_dir), tmp_path / "later").run())
     assert rows_without_time(tmp_path / "later") == rows_without_time(run_dir)
 

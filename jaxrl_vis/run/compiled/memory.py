@@ -146,7 +146,7 @@ def check_memory(
     return f"replay {format_bytes(replay)} of {format_bytes(available)}{suffix}"
 
 
-def check_compiled(programs: dict[str, Any], is_allocated: bool, layout: Layout = ONE_DEVICE) -> None:
+def check_compiled(programs: dict[str, Any], is_allocated: bool, layout: Layout = ONE_DEVICE) -> bool:
     """Compare the compiler's own figures with the free memory, before anything is allocated.
 
     Args:
@@ -154,32 +154,25 @@ def check_compiled(programs: dict[str, Any], is_allocated: bool, layout: Layout 
         is_allocated: True if the loop state is already on the device.
         layout: Placement of the run; the compiler's figures are those of one device.
 
+    Returns:
+        True if all programs fit into memory at once, so that one may be launched while another still runs, or if the free
+        memory is unknown.
+
     Raises:
         RequestError: A program's scratch memory does not fit beside the state.
     """
     available = _available_bytes(layout)
     if available is None:
-        return
+        return True
     state, scratch = _sizes(programs)
+    held = 0 if is_allocated else state
     for name, size in scratch.items():
-        if size + (0 if is_allocated else state) > available:
+        if size + held > available:
             raise RequestError(
                 f"{name} needs {format_bytes(size)} of scratch memory beside a state of {format_bytes(state)}; there are "
                 f"{format_bytes(available)}: lower --num-envs, --eval-episodes, --batch-size or --replay-transitions"
             )
-
-
-def fit_together(programs: dict[str, Any], is_allocated: bool, layout: Layout = ONE_DEVICE) -> bool:
-    """Return True if all programs fit into memory at once, so that one may be launched while another still runs.
-
-    The result is True, too, if the free memory is unknown.
-
-    Args:
-        programs, is_allocated, layout: As in `check_compiled`.
-    """
-    available = _available_bytes(layout)
-    state, scratch = _sizes(programs)
-    return available is None or sum(scratch.values()) + (0 if is_allocated else state) <= available
+    return sum(scratch.values()) + held <= available
 
 
 def _sizes(programs: dict[str, Any]) -> tuple[int, dict[str, int]]:
