@@ -89,16 +89,22 @@ def test_a_wrong_value_of_the_variable_is_refused(monkeypatch):
         use_gpu_kernels()
 
 
+def small_program() -> jax.stages.Traced:
+    """Return a traced program that compiles anywhere."""
+    return jax.jit(jnp.negative).trace(jnp.float32(0))
+
+
 def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypatch, capsys):
     gpu()
     calls = []
 
-    def breaks() -> None:
+    def breaks() -> jax.stages.Traced:
         calls.append(compilation.target_platform())
         raise RuntimeError("ptxas: no\nsecond line")
 
-    def works() -> None:
+    def works() -> jax.stages.Traced:
         calls.append("works")
+        return small_program()
 
     @jax.jit
     def traced(x):
@@ -128,12 +134,13 @@ def test_a_run_trusts_kernels_and_asks_where_its_programs_do_not_compile(gpu, mo
     monkeypatch.setattr(compilation, "_assumed", set())
     probed = []
 
-    def breaks() -> None:
+    def breaks() -> jax.stages.Traced:
         probed.append("breaks")
         raise RuntimeError("ptxas: no")
 
-    def works() -> None:
+    def works() -> jax.stages.Traced:
         probed.append("works")
+        return small_program()
 
     def function(keys):
         with tracing_for("cuda"):
@@ -162,8 +169,9 @@ def test_a_run_whose_programs_compile_asks_nothing(gpu):
     gpu()
     probed = []
 
-    def probe() -> None:
+    def probe() -> jax.stages.Traced:
         probed.append(True)
+        return small_program()
 
     def function(keys):
         with tracing_for("cuda"):
@@ -179,8 +187,9 @@ def test_the_kernels_themselves_are_probed_in_the_midst_of_a_trace(module, gpu):
     """Without a GPU, the kernels are compiled down to Triton's code only."""
     gpu()
 
-    def probe() -> None:
-        lowered_for_nvidia(module.probe_program)
+    def probe() -> jax.stages.Traced:
+        lowered_for_nvidia(module.probe)
+        return small_program()
 
     @jax.jit
     def traced(x):
@@ -304,7 +313,7 @@ def test_the_probe_of_the_kernel_is_an_instance_of_it(monkeypatch):
     """The probe can be lowered without a GPU; compiling it would need one."""
     from jaxrl_vis_envs.render.gpu import kernel
 
-    assert KERNEL_CALL in lowered_for_nvidia(kernel.probe_program)
+    assert KERNEL_CALL in lowered_for_nvidia(kernel.probe)
 
 
 @pytest.mark.parametrize("chosen", [(700, 10, 10), (0, 10, 10), (500_000, 5, 5)])

@@ -167,7 +167,7 @@ def test_where_the_kernel_does_not_compile_mjx_takes_the_steps(monkeypatch):
 
 
 def test_the_probe_is_a_kernel_for_nvidia():
-    assert "take_box_steps" in lowered_for_nvidia(box_kernel.probe_program)
+    assert "take_box_steps" in lowered_for_nvidia(box_kernel.probe)
 
 
 def test_inputs_table_and_outputs_of_a_warp():

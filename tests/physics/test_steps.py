@@ -483,7 +483,7 @@ def test_steps_are_taken_one_by_one_where_their_kernel_does_not_compile(monkeypa
 
 
 def test_the_probe_is_a_kernel_for_nvidia():
-    program = lowered_for_nvidia(steps_kernel.probe_program)
+    program = lowered_for_nvidia(steps_kernel.probe)
     assert "take_physics_steps" in program
 
 

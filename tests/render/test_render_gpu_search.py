@@ -160,5 +160,5 @@ def test_planes_seen_through_from_behind_take_the_plain_search() -> None:
 
 def test_kernels_for_triangles_are_lowered_for_nvidia() -> None:
     with tracing_for("cuda"), kernels(True):
-        text = lowered_for_nvidia(search.probe_program)
+        text = lowered_for_nvidia(search.probe)
     assert "find_triangle" in text and "find_blocker" in text

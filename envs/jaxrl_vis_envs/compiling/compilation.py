@@ -187,15 +187,15 @@ def any_kernel_failed() -> bool:
     return not all([_compiles(probe) for probe in sorted(_assumed, key=lambda probe: probe.__module__)])
 
 
-def use_gpu_kernels(probe: Callable[[], object] | None = None) -> bool:
+def use_gpu_kernels(probe: Callable[[], jax.stages.Traced] | None = None) -> bool:
     """Return True if the current trace uses hand-written kernels.
 
     They are used on NVIDIA GPUs of compute capability 8.0 or more if the probe compiles, unless JAXRL_VIS_KERNELS or `kernels`
     overrides this. Every function with a kernel also exists in plain JAX, for all other devices.
 
     Args:
-        probe: Function that compiles a small instance of the kernel, called once per process; if it raises, one line is printed
-            to stderr. It is not called within `assume_kernels_compile`. None for a kernel that is known to compile.
+        probe: Function that traces a small instance of the kernel, called once per process; if that does not compile, one line
+            is printed to stderr. It is not called within `assume_kernels_compile`. None for a kernel that is known to compile.
 
     Raises:
         ValueError: The environment variable is not 0, 1 or auto.
@@ -241,13 +241,13 @@ def _has_tensor_cores() -> bool:
 
 
 @functools.cache
-def _compiles(probe: Callable[[], object]) -> bool:
+def _compiles(probe: Callable[[], jax.stages.Traced]) -> bool:
     """Return True if a probe compiles for the first NVIDIA GPU; otherwise print the reason to stderr. Cached per probe."""
     gpu = jax.devices("cuda")[0]
 
     def compile_it() -> None:
         with jax.default_device(gpu), tracing_for("cuda"):
-            probe()
+            probe().lower().compile()
 
     try:
         # Probes are called during unrelated traces; the current trace is thread-local.

@@ -18,6 +18,7 @@ bottom:
 import functools
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
@@ -41,8 +42,8 @@ def supports(model: mjx.Model, exact: bool | None = None) -> bool:
     return scalar_model.supports(model) or (not exact and box_model.supports(model))
 
 
-def probe_of(model: mjx.Model) -> Callable[[], None]:
-    """Return the function that compiles a small instance of the kernel for a model, for `use_gpu_kernels`."""
+def probe_of(model: mjx.Model) -> Callable[[], jax.stages.Traced]:
+    """Return the function that traces a small instance of the kernel for a model, for `use_gpu_kernels`."""
     return box_kernel.probe if box_model.supports(model) else steps_kernel.probe
 
 

@@ -7,7 +7,6 @@ kernels.
 import dataclasses
 import functools
 from collections.abc import Hashable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -99,13 +98,8 @@ _PROBE = """
 """
 
 
-def probe() -> None:
-    """Compile a small instance of the kernel for the default device; raise any error of the compilation."""
-    probe_program().lower().compile()
-
-
-def probe_program() -> Any:
-    """Trace a small instance of the kernel (`jax.stages.Traced`): a hinge, a slide, dry friction, a limit and a contact."""
+def probe() -> jax.stages.Traced:
+    """Trace a small instance of the kernel: a hinge, a slide, dry friction, a limit and a contact."""
     model = mujoco.MjModel.from_xml_string(_PROBE)
     constants = scalar_model.build_scalar_model(mjx.put_model(model, device=jax.local_devices()[0]))
     joints = jnp.zeros((2, 2), jnp.float32)

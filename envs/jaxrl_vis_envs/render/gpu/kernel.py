@@ -384,13 +384,8 @@ def _inputs(scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_ta
     )
 
 
-def probe() -> None:
-    """Compile a small instance of the kernel."""
-    probe_program().lower().compile()
-
-
-def probe_program() -> Any:
-    """Trace a small instance of the kernel (`jax.stages.Traced`): every type of object, two lights, a texture, a sky."""
+def probe() -> jax.stages.Traced:
+    """Trace a small instance of the kernel: every type of object, two lights, a texture, a sky."""
     mj_model = mujoco.MjModel.from_xml_string(_PROBE)
     mj_data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, mj_data)

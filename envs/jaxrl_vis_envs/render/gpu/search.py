@@ -224,13 +224,8 @@ def _shared_refs(
     return Refs(**blocks)
 
 
-def probe() -> None:
-    """Compile small instances of both kernels."""
-    probe_program().lower().compile()
-
-
-def probe_program() -> Any:
-    """Trace small instances of both kernels (`jax.stages.Traced`)."""
+def probe() -> jax.stages.Traced:
+    """Trace small instances of both kernels."""
     mj_model = mujoco.MjModel.from_xml_string(_PROBE)
     mj_data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, mj_data)

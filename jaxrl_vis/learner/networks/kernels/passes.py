@@ -53,16 +53,8 @@ def is_available() -> bool:
         return use_gpu_kernels(probe)
 
 
-def probe() -> None:
-    """Compile small instances of three kernels for the default device: preparation, forward and backward pass.
-
-    Any error of the compilation is raised.
-    """
-    probe_program().lower().compile()
-
-
-def probe_program() -> Any:
-    """Trace small instances of the three kernels of `probe` in one program (`jax.stages.Traced`)."""
+def probe() -> jax.stages.Traced:
+    """Trace small instances of three kernels in one program: preparation, forward and backward pass."""
     shape, levels = (4, 16, 16), LEVELS + 1
     images, of_pixels = jnp.zeros((MIN_ROWS, *shape), jnp.uint8), jnp.zeros(shape)
     sizes = (64, 64), (64, 16), (64, 16)

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Hashable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -110,13 +109,8 @@ _PROBE = """
 """
 
 
-def probe() -> None:
-    """Compile a small instance of the kernel for the default device; raise any error of the compilation."""
-    probe_program().lower().compile()
-
-
-def probe_program() -> Any:
-    """Trace a small instance of the kernel (`jax.stages.Traced`): a box on a table beside a finger on a slide."""
+def probe() -> jax.stages.Traced:
+    """Trace a small instance of the kernel: a box on a table beside a finger on a slide."""
     model = build_box_model(mjx.put_model(mujoco.MjModel.from_xml_string(_PROBE), device=jax.local_devices()[0]))
     position, rates = jnp.zeros((2, 8), jnp.float32), jnp.zeros((2, 7), jnp.float32)
 
