@@ -16,6 +16,7 @@ import functools
 import itertools
 import json
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,7 @@ Find = Callable[[np.ndarray, float | None, Band | None, PlotFolder, PairFiles], 
 band (None if unknown), and its folder and files; returns the detections in pixels of the image."""
 NO_ODOMETRY = "no odometry"
 NO_FIT = "odometry does not fit the images"
+_OVERLAYS_AT_ONCE = 8
 SKIPPED_COLUMNS = ("plot", "pair", "why")
 
 
@@ -102,8 +104,7 @@ def run(
         find: Stalk detector; must be picklable if there is more than one worker.
         request: Options of the run.
         done: Progress callback, called after each pair with the plot's name, and the numbers of finished and of all its pairs.
-        workers: Number of processes that measure pairs and render overlays, except for the first pair; 1 to use the calling
-            process.
+        workers: Number of processes that measure pairs, except for the first one; 1 to use the calling process.
         echo: Callback for each plot without a count, with its name and the reason.
 
     Returns:
@@ -177,7 +178,7 @@ def _run(
             for pair, record in zip(plot.pairs, records)
             if "skipped" in record
         ]
-        result = _finish_plot(plot, records, distances[plot.name], request, run_all)
+        result = _finish_plot(plot, records, distances[plot.name], request)
         if result.row["stalks"] == "":
             echo(plot.name, result.row["flag"] + (f" ({result.count_reason})" if result.count_reason else ""))
         page.add(result)
@@ -280,7 +281,7 @@ def _make_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles
 
 
 def _finish_plot(
-    plot: PlotFolder, records: list[dict[str, Any]], distances: dict[str, float] | None, request: Request, run_all: UnorderedMap
+    plot: PlotFolder, records: list[dict[str, Any]], distances: dict[str, float] | None, request: Request
 ) -> PlotResult:
     """Track the stalks of a plot, compute its table rows, and render its overlays.
 
@@ -289,7 +290,6 @@ def _finish_plot(
         records: Record of each pair.
         distances: Distance driven at each pair by the pair's name, m; None if unknown.
         request: Options of the run.
-        run_all: Map over jobs in the worker processes.
     """
     usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
     skipped = len(records) - len(usable)
@@ -318,7 +318,7 @@ def _finish_plot(
     strange = _unfamiliar_note([record for _, record in usable])
     if strange:
         row = {**row, "flag": UNFAMILIAR if row["flag"] == "ok" else f"{row['flag']}; {UNFAMILIAR}"}
-    _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, run_all)
+    _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels)
     width = usable[0][1]["size"][1] if usable else 0
     why = why or (_missing_count_reason(row["flag"], frames, plot, distances) if row["stalks"] == "" else "")
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width, why, strange)
@@ -342,7 +342,6 @@ def _draw_overlays(
     folder: Path,
     usable: list[tuple[PairFiles, dict[str, Any]]],
     labels: list[list[str | None]],
-    run_all: UnorderedMap,
 ) -> None:
     """Write the overlays of a plot that are missing or outdated, and delete those of pairs that are no longer usable."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -363,8 +362,9 @@ def _draw_overlays(
         # Drop outdated digests before rendering, so that an interruption leaves no overlay with a wrong digest.
         current = {name: digest for name, digest in drawn.items() if digest == shown.get(name)}
         write_atomically(index, json.dumps(current) + "\n")
-    for _ in run_all(functools.partial(_draw_overlay, plot), missing):
-        pass
+    with ThreadPoolExecutor(_OVERLAYS_AT_ONCE) as threads:  # nearly all of it is OpenCV's work, which lets others run
+        for _ in threads.map(functools.partial(_draw_overlay, plot), missing):
+            pass
     if drawn != shown:
         write_atomically(index, json.dumps(shown) + "\n")
 

@@ -1,6 +1,8 @@
 """Reading and validation of the images of a stereo pair and of precomputed disparities."""
 
+import functools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -40,7 +42,8 @@ def read_pair(pair: PairFiles, calibration: Calibration | None, right_needed: bo
     if calibration is not None and sizes[0] != (calibration.height, calibration.width):
         wanted = f"{calibration.width} x {calibration.height}"
         raise UnusablePairError(f"the images have {_format_size(sizes[0])} pixels, but the calibration is for {wanted}")
-    images = [read_side(pair, side) for side in sides]
+    with ThreadPoolExecutor() as threads:
+        images = list(threads.map(functools.partial(read_side, pair), sides))
     left, right = images[0], images[-1]
     if left.shape != right.shape:  # the file was replaced in the meantime
         raise UnusablePairError(
