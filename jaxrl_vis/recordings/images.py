@@ -15,7 +15,7 @@ from PIL import Image
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.provenance import install_command
 
-_CODEC, PIXEL_FORMAT = "libx264rgb", "gbrp"
+_CODEC = "libx264rgb"
 # Lossless; a whole image every eighth frame, so that any frame is soon decoded; no frame that refers to later ones, so that
 # times in the file are those of the frames.
 _OPTIONS = {"qp": "0", "preset": "slow", "g": "8", "bf": "0"}

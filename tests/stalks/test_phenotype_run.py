@@ -1,8 +1,11 @@
 """Tests of the commands that count and measure: their tables, comparison with the ground truth, and figures."""
 
+import dataclasses
 import functools
 import json
+import multiprocessing
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +70,31 @@ def test_labels_stay_in_the_image_and_darken_their_own_place_only(top):
 def sign(folder, image, pixels_per_metre, band, plot, pair):
     (folder / f"{plot.name} {pair.name}").write_text(str(os.getpid()))
     return []
+
+
+def meet(folder, image, pixels_per_metre, band, plot, pair):
+    """Find nothing, once pairs of two plots are processed at the same time."""
+    if multiprocessing.parent_process() is not None:
+        (folder / plot.name).touch()
+        for _ in range(600):
+            if len(list(folder.glob("plot_*"))) == 2:
+                return []
+            time.sleep(0.05)
+        raise TimeoutError
+    return []
+
+
+def test_workers_do_not_wait_for_the_end_of_a_plot(plots, tmp_path):
+    first, second = find_plots(plots)
+    there = [dataclasses.replace(first, pairs=first.pairs[:2]), dataclasses.replace(second, pairs=second.pairs[:1])]
+    calibrations = {plot.name: read_calibration(plots / plot.name / "calibration.yaml") for plot in there}
+    said = []
+    request = Request(tmp_path / "out", "strip", "nobody", calibrations)
+    pipeline.run(there, functools.partial(meet, tmp_path), request, lambda *words: said.append(words), workers=2)
+    assert sorted(said) == [(first.name, 1, 2), (first.name, 2, 2), (second.name, 1, 1)]
+    again = []
+    rows, _ = pipeline.run(there, functools.partial(meet, tmp_path), request, lambda *words: again.append(words), workers=2)
+    assert again == [(first.name, 2, 2), (second.name, 1, 1)] and [row["plot"] for row in rows] == [first.name, second.name]
 
 
 def test_this_process_compiles_for_its_workers(plots, tmp_path):

@@ -8,7 +8,7 @@
         qc.html                  the same with images, and what was rejected
 
 Tables are always derived from the files under pairs/, so they depend neither on interruptions nor on the number of processes.
-Each process has one pair in memory at a time.
+Each process has one pair in memory at a time, and this one up to eight images to draw overlays on.
 """
 
 import dataclasses
@@ -152,27 +152,31 @@ def _run(
     echo: Callable[[str, str], None],
     run_all: UnorderedMap,
 ) -> tuple[list[Row], list[Row]]:
-    """Process plots one by one; return the rows of plots.csv and skipped.csv. See `run` for the arguments."""
+    """Process plots; return the rows of plots.csv and skipped.csv. See `run` for the arguments."""
     stalks: list[Row] = []
     rows: list[Row] = []
     skipped: list[Row] = []
-    # The first pair is processed here, which compiles for all: each worker would compile the same with a fraction of the cores.
-    here = 1
+    missing: list[tuple[PlotFolder, PairFiles]] = []
+    pairs = {plot.name: len(plot.pairs) for plot in plots}
+    left: dict[str, int] = {}
     for plot in plots:
-        folder = request.out / "pairs" / file_name(plot.name)
-        folder.mkdir(parents=True, exist_ok=True)
-        paths = {pair.name: folder / file_name(f"{pair.name}.json") for pair in plot.pairs}
-        calibration = request.calibrations[plot.name]
-        missing = [pair for pair in plot.pairs if not is_current(paths[pair.name], _sources(pair, calibration), _is_complete)]
-        for number in range(1, len(plot.pairs) - len(missing) + 1):
-            done(plot.name, number, len(plot.pairs))
-        make_record = functools.partial(_pair_record, plot, find, request)
-        made = itertools.chain(map(make_record, missing[:here]), run_all(make_record, missing[here:]))
-        here = 0 if missing else here
-        for number, (name, record, sources) in enumerate(made, start=1):
-            write_record(paths[name], record, sources)
-            done(plot.name, len(plot.pairs) - len(missing) + number, len(plot.pairs))
-        records = [read_json(paths[pair.name]) for pair in plot.pairs]
+        _record_path(request, plot.name, "").parent.mkdir(parents=True, exist_ok=True)
+        outdated = [pair for pair in plot.pairs if not _is_current(request, plot.name, pair)]
+        missing += [(plot, pair) for pair in outdated]
+        left[plot.name] = len(outdated)
+        if len(outdated) < pairs[plot.name]:
+            done(plot.name, pairs[plot.name] - len(outdated), pairs[plot.name])
+    make_record = functools.partial(_pair_record, find, request)
+    # The first pair is processed here, which compiles for all: each worker would compile the same with a fraction of the cores.
+    # Workers go on with the next plots while this process finishes one.
+    made = itertools.chain(map(make_record, missing[:1]), run_all(make_record, missing[1:]))
+    for plot in plots:
+        while left[plot.name]:
+            name, pair, record, sources = next(made)
+            write_record(_record_path(request, name, pair), record, sources)
+            left[name] -= 1
+            done(name, pairs[name] - left[name], pairs[name])
+        records = [read_json(_record_path(request, plot.name, pair.name)) for pair in plot.pairs]
         bad = [
             {"plot": plot.name, "pair": pair.name, "why": record["skipped"]}
             for pair, record in zip(plot.pairs, records)
@@ -240,11 +244,20 @@ def _sources(pair: PairFiles, calibration: Calibration | None) -> dict[str, Any]
     return {**pair_state(pair), "calibration": None if calibration is None else value_digest(dataclasses.asdict(calibration))}
 
 
-def _pair_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> tuple[str, dict[str, Any], dict[str, Any]]:
-    """Return the name of a pair, its record, and the state of the record's sources."""
-    calibration = request.calibrations[plot.name]
-    sources = _sources(pair, calibration)  # before the files are read, as they may be replaced meanwhile
-    return pair.name, _make_record(plot, find, request, pair), sources
+def _record_path(request: Request, plot: str, pair: str) -> Path:
+    return request.out / "pairs" / file_name(plot) / file_name(f"{pair}.json")
+
+
+def _is_current(request: Request, plot: str, pair: PairFiles) -> bool:
+    """Return True if there is a complete record of a pair as it is now."""
+    return is_current(_record_path(request, plot, pair.name), _sources(pair, request.calibrations[plot]), _is_complete)
+
+
+def _pair_record(find: Find, request: Request, job: tuple[PlotFolder, PairFiles]) -> tuple[str, str, dict[str, Any], Any]:
+    """Return the names of a plot and of its pair, the pair's record, and the state of the record's sources."""
+    plot, pair = job
+    sources = _sources(pair, request.calibrations[plot.name])  # before the files are read, as they may be replaced meanwhile
+    return plot.name, pair.name, _make_record(plot, find, request, pair), sources
 
 
 def _make_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> dict[str, Any]:
