@@ -181,7 +181,10 @@ def stalks_at(disparity: int, *others: int) -> tuple[np.ndarray, np.ndarray, lis
     return left, right, finds
 
 
-@pytest.mark.parametrize(("disparity", "sizes"), [(68, [0.8]), (50, [0.8, 0.55, 1.15]), (97, [0.8, 0.55])])
+NEARER, FARTHER = 0.8 / 1.06**6, 0.8 * 1.06**6
+
+
+@pytest.mark.parametrize(("disparity", "sizes"), [(68, [0.8]), (50, [0.8, NEARER, FARTHER]), (97, [0.8, NEARER])])
 def test_a_row_elsewhere_is_looked_for_at_the_size_that_it_has_there(disparity, sizes):
     """A detector that detects stalks of one size only is called with other scales until the stereo distance confirms one."""
     left, right, finds = stalks_at(disparity)
@@ -194,6 +197,25 @@ def test_a_row_elsewhere_is_looked_for_at_the_size_that_it_has_there(disparity, 
 
     view = view_pair(find, left, right, CAMERA)
     assert asked == pytest.approx(sizes) and all(each.diameter_mm for each in view.sightings) and len(view.sightings) == 6
+
+
+def test_rows_at_all_distances_are_looked_for_at_few_sizes(monkeypatch):
+    """Networks are compiled for each size of the image, and stereo tells another distance for each pair."""
+    left, right, _ = stalks_at(68)
+    asked = []
+
+    def find(image: np.ndarray, pixels_per_metre: float | None, band: Band | None) -> list[Detection]:
+        assert pixels_per_metre is not None
+        asked.append(CAMERA.focal / pixels_per_metre)
+        return []
+
+    distances = np.linspace(0.5, 0.7, 41)
+    for distance in distances:
+        monkeypatch.setattr("jaxrl_vis.stalks.phenotyping.track.sightings.row_distance", lambda _, distance=distance: distance)
+        view_pair(find, left, right, CAMERA)
+    assert asked[::2] == [0.8] * 41
+    np.testing.assert_allclose(asked[1::2], distances, rtol=0.031)
+    assert len(set(asked)) <= 8
 
 
 def test_the_field_of_a_crop_is_its_own():

@@ -228,15 +228,10 @@ def _is_complete(record: dict[str, Any]) -> bool:
         KeyError, TypeError, ValueError: It is not, or the pair was skipped, which is then tried again.
     """
     rows, columns = record["size"]
+    (top, bottom), (left, right) = record["lines"], record["columns"]
     for values in record["sightings"]:
         Sighting.read(values)
-    return all(isinstance(count, int) for count in (rows, columns, *_span(record["lines"]), *_span(record["columns"])))
-
-
-def _span(values: Any) -> tuple[Any, Any]:
-    """Unpack the half-open range of visible rows or columns of a record."""
-    first, last = values
-    return first, last
+    return all(isinstance(count, int) for count in (rows, columns, top, bottom, left, right))
 
 
 def _sources(pair: PairFiles, calibration: Calibration | None) -> dict[str, Any]:

@@ -20,13 +20,10 @@ def resolve_weights(weights: Path | None) -> Path:
     Raises:
         RequestError: There is no such file.
     """
-    if weights is None and not SHIPPED.exists():
-        raise RequestError(
-            "no weights come with this version: make some with `jaxrl-vis phenotype train`, and name them with --weights"
-        )
-    if weights is not None and not weights.is_file():
-        raise RequestError(f"cannot read the weights {weights}: no such file")
-    return SHIPPED if weights is None else weights
+    path = SHIPPED if weights is None else weights
+    if not path.is_file():
+        raise RequestError(f"cannot read the weights {path}: no such file")
+    return path
 
 
 def detector_name(weights: Path) -> str:

@@ -17,6 +17,7 @@ from jaxrl_vis_envs.plants.truth import BAND
 
 _FOCAL = 1084.0  # pixels: focal length of the downscaled images, in which the grain of the ground remains visible
 _WINDOW = (5, 41)  # height and width in the downscaled image: flat, as the depth of the ground changes from row to row
+_DEPTHS = (3.0, 0.45)  # m: maximum and minimum depth of matched windows
 _COLUMNS, _ROWS = 32, 32  # numbers of windows horizontally and vertically
 _MIN_SCORE = 0.7
 _TOLERANCE = 0.7  # pixels of the downscaled image
@@ -80,7 +81,6 @@ def find_ground(
     right: np.ndarray,
     calibration: Calibration,
     disparity: np.ndarray | None = None,
-    depths: tuple[float, float] = (0.45, 3.0),
 ) -> Ground | None:
     """Find the ground plane of a pair; return None if it is not visible, or too little of it.
 
@@ -88,7 +88,6 @@ def find_ground(
         left, right: Rectified greyscale images [H, W], uint8 or float32.
         calibration: Calibration of the cameras, for images of this size.
         disparity: Known disparities [H, W] float32 to use instead of matching, pixels; NaN where unknown. None to match.
-        depths: Minimum and maximum depth of matched windows, m; unused with ``disparity``.
     """
     frame = find_frame(left)
     part = (slice(*frame.rows), slice(*frame.columns))
@@ -98,7 +97,7 @@ def find_ground(
     if scale < 1.0:
         size = (round(left.shape[1] * scale), round(left.shape[0] * scale))
         left, right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right))
-    bounds = tuple(float(calibration.disparity(np.array(depth))) * scale for depth in reversed(depths))
+    bounds = tuple(float(calibration.disparity(np.array(depth))) * scale for depth in _DEPTHS)
     if disparity is None:
         places, values = _match_windows(left, right, (bounds[0], bounds[1]))
     else:

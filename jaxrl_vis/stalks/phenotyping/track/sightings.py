@@ -30,6 +30,7 @@ USUAL_DISTANCE = 0.8
 """Default distance from the cameras to the row of plants, m."""
 _OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is found at the usual one
 _SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
+_STEP = 1.06  # between the distances for which images are scaled
 _FAR_FROM_ROW = 0.2  # m: distance from the row beyond which a match is suspicious
 # Factor of the confidence of a measurement with an edge that may be occluded; at 24 inches, fewer of these are lower bounds.
 _OCCLUSION_FACTOR, _UPPER_OCCLUSION_FACTOR = 0.1, 0.025
@@ -216,12 +217,17 @@ def view_pair(
         return usual
     for distance in _OTHER_DISTANCES if there is None else (there,):
         band = functools.partial(band_rows, ground, calibration, distance)
-        detections = find(left, calibration.focal / distance, band)
+        detections = find(left, calibration.focal / _rounded(distance), band)
         sightings = measure_pair(detections, left, right, calibration, method, ground, disparity)
         there = row_distance(sightings)
         if there is not None and abs(there / distance - 1.0) <= _SAME_DISTANCE:
             return PairView(detections, sightings, ground, frame)
     return usual
+
+
+def _rounded(distance: float) -> float:
+    """Round a distance by 3 % at most: networks are compiled for each size of an image."""
+    return USUAL_DISTANCE * _STEP ** round(math.log(distance / USUAL_DISTANCE, _STEP))
 
 
 def row_distance(sightings: list[Sighting]) -> float | None:
