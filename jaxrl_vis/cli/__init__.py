@@ -140,6 +140,11 @@ def _run_with_status(argv: Sequence[str], ending: Ending) -> int:
         return 1
 
 
+# Python maps and unmaps memory when calls cross the end of a chunk of frames, often while tracing. The frame of this function
+# needs half of a chunk of 2 MB; calls from it share the rest.
+_run_with_status.__code__ = _run_with_status.__code__.replace(co_stacksize=131_072)
+
+
 def _report_signal(number: int) -> int:
     print(f"{PROGRAM}: {signal_name(number)}: ended before it was done", file=sys.stderr)
     return 128 + number

@@ -3,6 +3,7 @@ import os
 import re
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any, get_args
@@ -420,3 +421,30 @@ def test_a_reader_that_closes_its_pipe_is_not_an_error() -> None:
         program.stdout.close()
         assert program.stderr.read() == ""
         assert program.wait() == 141
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts page faults of a thread")
+def test_calls_of_a_command_map_no_memory_at_any_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the end of a chunk of Python's frames, each of a thousand calls would map one; a thread has its own chunks."""
+    import resource
+
+    counts: list[int] = []
+
+    def count_faults(depth: int) -> int:
+        if depth:
+            return count_faults(depth - 1)
+        before = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt
+        for _ in range(1000):
+            sum(map(abs, (1,)))
+            str.join(",", (letter for letter in "ab"))
+        return resource.getrusage(resource.RUSAGE_THREAD).ru_minflt - before
+
+    def command() -> int:
+        counts.extend(count_faults(depth) for depth in range(300))
+        return 0
+
+    monkeypatch.setattr(cli, "_parse_command", lambda argv: command)
+    thread = threading.Thread(target=cli.main, args=([],))
+    thread.start()
+    thread.join()
+    assert len(counts) == 300 and max(counts) < 500

@@ -11,13 +11,11 @@ a CPU about half as fast (FetchReach, 64 environments, two cores: 1,100 environm
 the notebooks therefore install 0.10 where there is no GPU (requirements/cpu.in).
 
 On a GPU the many small kernels of a gradient step are launched together, as a CUDA graph. By default XLA chains them; here
-independent kernels may run concurrently: a gradient step of VisualFetchReach (64x64, H100) took 548 us instead of 689 with the
-preset paper, and 438 instead of 489 with fast.
+independent kernels may run concurrently, which makes gradient steps a tenth to a fifth faster (docs/lab/gradient_step.md).
 
 XLA also autotunes the tile of every matrix product there, by compiling and timing some thirty kernels per product. That took
-four fifths of the compilation time of gradient steps (66 to 75 processor seconds instead of 18), for steps no faster than with
-one tile for all products, `_TILE` (paper 544 us and 540 to 562, fast 379 and 377 us). XLA still chooses NVIDIA's own kernels
-where they are faster, as for large matrices.
+four fifths of the compilation time of gradient steps, for steps no faster than with one tile for all products, `_TILE`. XLA
+still chooses NVIDIA's own kernels where they are faster.
 
 Code that is fast on a CPU is slow on a GPU and vice versa, and some functions have a hand-written kernel for NVIDIA GPUs
 (Pallas, by Triton). The choice follows the platform that a program is compiled for, which is not always the default backend
