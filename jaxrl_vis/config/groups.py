@@ -270,7 +270,7 @@ class StudyOptions:
     weighting_main_grad: Annotated[Literal["main", "total"], OL_AUX] = "main"
     """Gradient with which OL-AUX compares the auxiliary gradients: that of the main loss or, as in the authors' release, of the
     total loss."""
-    weighting_window: Annotated[Count, OL_AUX] = 1
+    weighting_window: Annotated[Count, OfWeighting(("ol_aux",))] = 1
     """Number of gradient steps over which OL-AUX averages gradients before comparing them; 4 in the authors' release."""
     weighting_log: Annotated[bool, OfWeighting(LOG_WEIGHTINGS)] = False
     """Minimise the logarithms of the losses, with a weighting that does not do so by default."""

@@ -96,7 +96,6 @@ def ol_aux_ablation(
     eps: Eps = 0.02,
     main_eps: float = 1e-8,
     main_grad: MainGradient = "main",
-    window: int = 1,
     minimum: float | None = 0.0,
 ) -> Weighting:
     """Build OL-AUX-N (Ablation) of figure 5.7: the one-step rule every N updates, on as much data as OL-AUX-N uses.
@@ -109,16 +108,12 @@ def ol_aux_ablation(
         interval: N.
         learning_rate, beta, log, eps, main_eps, minimum: See `ol_aux.ol_aux`.
         main_grad: See `ol_aux_window`.
-        window: Must be 1; gradients are already averaged over the interval.
 
     Raises:
         RequestError: An argument is invalid; from ``init``: ``shared`` or ``params`` is not given; from ``update``: the state
             belongs to another weighting.
     """
     label = "ol_aux_ablation"
-    check_count(label, "window", window)
-    if window > 1:
-        raise RequestError(f"weighting {label} averages gradients over its interval already; leave window at 1")
     _check_main_grad(label, main_grad)
     move = make_rule(label, interval, learning_rate, beta, minimum)
 

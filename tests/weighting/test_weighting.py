@@ -343,7 +343,7 @@ def test_what_comes_beside_the_losses() -> None:
         (lambda: make_weighting("ol_aux", interval=2.5), ["interval", "a whole number, not 2.5"]),
         (lambda: make_weighting("ol_aux", beta=float("nan")), ["finite"]),
         (lambda: make_weighting("ol_aux", main_grad="totl"), ["main_grad", "did you mean total"]),
-        (lambda: make_weighting("ol_aux_ablation", window=4), ["leave window at 1"]),
+        (lambda: make_weighting("ol_aux_ablation", window=4), ["no option 'window'"]),
         (lambda: make_weighting("balance", eps=0.0), ["eps of weighting balance", "greater than 0"]),
         (lambda: make_weighting("fixed", weights=float("inf")), ["finite"]),
         (lambda: make_weighting("fixed", weights={"nera": 1.0}).init(NAMES), ["'nera'", "did you mean near"]),
