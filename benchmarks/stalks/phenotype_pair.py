@@ -10,7 +10,6 @@ import resource
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +21,8 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import detect, pad_image
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, resize
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
 from jaxrl_vis.stalks.phenotyping.measure.ground import find_ground
-from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, detect_with_ground, measure_pair, to_grey_bytes
+from jaxrl_vis.stalks.phenotyping.track.pairing import PairView, view_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, measure_pair, to_grey_bytes
 from jaxrl_vis_envs.plants import SHIFTED, Calibration, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import stalks_in_view
@@ -37,8 +37,7 @@ def make(path: Path, stated: Calibration) -> tuple[Once, int]:
 
     def once(number: int) -> list[float]:
         left, right = pairs[number]
-        detections, ground = detect_with_ground(finder, left, right, stated)
-        return [sighting.diameter_mm or 0.0 for sighting in measure_pair(detections, left, right, stated, ground=ground)]
+        return [sighting.diameter_mm or 0.0 for sighting in view_pair(finder, left, right, stated).sightings]
 
     return once, len(pairs)
 
@@ -52,15 +51,15 @@ if __name__ == "__main__":
     params, settings, _ = read_weights(SHIPPED)
     finder = Finder(params, settings)
 
-    def once() -> tuple[Any, Any, list[Any]]:
-        """Process one pair: detections, ground and sightings."""
-        detections, ground = detect_with_ground(finder, left, right, stated)
-        return detections, ground, measure_pair(detections, left, right, stated, ground=ground)
+    def once() -> PairView:
+        """Process one pair."""
+        return view_pair(finder, left, right, stated)
 
     started = time.perf_counter()
-    detections, ground, sightings = once()
+    view = once()
+    detections, ground = view.detections, view.ground
     first = time.perf_counter() - started
-    measured = sum(sighting.diameter_mm is not None for sighting in sightings)
+    measured = sum(sighting.diameter_mm is not None for sighting in view.sightings)
     seconds = time_repeats(once, asked.repeats)
     print(f"{left.shape[1]} x {left.shape[0]}, {len(detections)} detections, {measured} measured, on {device_name()}")
     print(f"{np.median(seconds):.3f} s a pair (least {min(seconds):.3f}); the first one, which compiles, {first:.1f} s")

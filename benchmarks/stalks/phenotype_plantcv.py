@@ -32,7 +32,7 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
     from jaxrl_vis.stalks.phenotyping.evaluation.perfect import perfect_detections
     from jaxrl_vis.stalks.phenotyping.evaluation.scoring import match_detections, true_diameter
-    from jaxrl_vis.stalks.phenotyping.track.sightings import detect_with_ground, measure_pair
+    from jaxrl_vis.stalks.phenotyping.track.pairing import view_pair
     from jaxrl_vis_envs.plants import FAMILIES, draw
     from jaxrl_vis_envs.plants.pairs import Sequence
     from jaxrl_vis_envs.plants.truth import HEIGHTS, stalks_in_view
@@ -49,12 +49,11 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
         left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
         views = stalks_in_view(sequence.plot, pair.pose, true, instance, np.asarray(pair.depth))
         ideal = perfect_detections(map(dataclasses.asdict, views), instance)
-        finds, ground = detect_with_ground(
+        view = view_pair(
             (lambda image, pixels_per_metre, band, ideal=ideal: ideal) if options.truth else finder, left, right, stated
         )
-        sightings = measure_pair(finds, left, right, stated, ground=ground)
-        owners, _ = match_detections(finds, views)
-        for find, sighting, owner in zip(finds, sightings, owners):
+        owners, _ = match_detections(view.detections, views)
+        for find, sighting, owner in zip(view.detections, view.sightings, owners):
             at = sighting.height_m
             if owner is None or sighting.diameter_mm is None or at is None or abs(at - HEIGHTS[0]) > 0.0127:
                 continue

@@ -31,8 +31,8 @@ from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, fi
 from jaxrl_vis.stalks.phenotyping.measure.lens import VALIDATED, lens_fault
 from jaxrl_vis.stalks.phenotyping.report.tables import Origin, plot_rows
 from jaxrl_vis.stalks.phenotyping.track.follow import RobotPath, Track, track_stalks
-from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
-from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, measure_pair, view_pair
+from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault, view_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, measure_pair
 from jaxrl_vis_envs.plants import Calibration
 
 CAMERA = Calibration(844, 400, 542.0, (421.5, 199.5), 0.1)
@@ -211,7 +211,7 @@ def test_rows_at_all_distances_are_looked_for_at_few_sizes(monkeypatch):
 
     distances = np.linspace(0.5, 0.7, 41)
     for distance in distances:
-        monkeypatch.setattr("jaxrl_vis.stalks.phenotyping.track.sightings.row_distance", lambda _, distance=distance: distance)
+        monkeypatch.setattr("jaxrl_vis.stalks.phenotyping.track.pairing.row_distance", lambda _, distance=distance: distance)
         view_pair(find, left, right, CAMERA)
     assert asked[::2] == [0.8] * 41
     np.testing.assert_allclose(asked[1::2], distances, rtol=0.031)

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from phenotype_plots import run, table
 from jaxrl_vis import cli
 from jaxrl_vis.stalks.cli.options import PlantOptions
 from jaxrl_vis.stalks.phenotyping import pipeline
+from jaxrl_vis.stalks.phenotyping.evaluation import scoring
 from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import read_image
@@ -140,6 +142,23 @@ def test_eval_compares_with_the_truth(plots, tmp_path, capsys):
     assert figures["each"][0]["widths_mm"] and figures["each"][0]["seconds_per_pair"] > 0
     said = capsys.readouterr().out
     assert "synthetic plots of family" in said and "count_mae" in said
+
+
+def test_eval_looks_for_rows_elsewhere_as_run_does(monkeypatch):
+    """Stalks are looked for at the usual distance, and again at the one that stereo shows."""
+    family = FAMILIES["training"].at_width(422)
+    family = dataclasses.replace(family, rig=dataclasses.replace(family.rig, frames=2, distance=0.6, distance_sd=0.0))
+    distances = []
+    true_detections = scoring._true_detections
+
+    def find(stalks: Any, instance: Any, image: Any, pixels_per_metre: float, band: Any) -> Any:
+        distances.append(family.rig.focal / pixels_per_metre)
+        return true_detections(stalks, instance, image, pixels_per_metre, band)
+
+    monkeypatch.setattr(scoring, "_true_detections", find)
+    score = scoring.score_plot(family, 0, None)
+    assert len(distances) == 4 and distances[::2] == pytest.approx([0.8, 0.8], rel=0.02)
+    assert distances[1::2] == pytest.approx([0.6, 0.6], rel=0.1) and len(score.detections) > 4
 
 
 def test_eval_in_two_processes_and_after_a_stop_is_the_same(plots, tmp_path, capsys):

@@ -51,8 +51,8 @@ from jaxrl_vis.stalks.phenotyping.report.tables import (
 )
 from jaxrl_vis.stalks.phenotyping.track.direction import track_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track
-from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
-from jaxrl_vis.stalks.phenotyping.track.sightings import NO_CALIBRATION, USUAL_DISTANCE, Sighting, row_distance, view_pair
+from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault, view_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import NO_CALIBRATION, USUAL_DISTANCE, Sighting, row_distance
 from jaxrl_vis.stalks.results_folder import claim_folder, is_current, pair_state, write_record
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration

@@ -20,7 +20,8 @@ from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis.stalks.phenotyping.track.follow import track_stalks
 from jaxrl_vis.stalks.phenotyping.track.heights import stalk_widths
-from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Find, Sighting, detect_with_ground, measure_pair
+from jaxrl_vis.stalks.phenotyping.track.pairing import view_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import Find, Sighting
 from jaxrl_vis_envs.plants import Family, Stalk, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import HEIGHTS, StalkInView, stalks_in_view
@@ -41,7 +42,7 @@ class PlotScore:
         widths: Measured and true diameter at 12 inches of each stalk that was counted and identified, [N, 2] float64, mm.
         errors: Standard error of each measured diameter at 12 inches, [N] float64, mm.
         upper: Measured and true diameter at 24 inches, [M, 2] float64, mm.
-        seconds: Mean time of detection and measurement per pair, images in memory, without the first pair, which includes
+        seconds: Median time of detection and measurement per pair, images in memory, without the first pair, which includes
             compilation; NaN for a single pair.
         thesis: Score of the thesis's methods on the same detections; None if they were not evaluated.
         detections: Score of each detection, and 1 for a true or 0 for a false positive, [K, 2] float64; matches of mostly
@@ -94,8 +95,6 @@ def score_plot(
     """
     sequence = Sequence.of(draw(family, seed))
     drive, plot = sequence.drive, sequence.plot
-    # By day, each plot has its own distance, which `phenotype run` estimates by stereo.
-    distance = plot.family.rig.distance if plot.family.scene.share > 0 else USUAL_DISTANCE
     frames: list[list[Sighting]] = []
     outcomes: list[tuple[list[Detection], list[int], list[StalkInView]]] = []
     as_thesis: list[list[Sighting]] = []
@@ -105,15 +104,15 @@ def score_plot(
         stalks = stalks_in_view(plot, pair.pose, drive.true, instance, np.asarray(pair.depth))
         started = time.monotonic()
         finder = find or functools.partial(_true_detections, stalks, instance)
-        detections, ground = detect_with_ground(finder, left, right, drive.stated, distance=distance)
-        selected = [place for place, detection in enumerate(detections) if detection.score >= min_score]
-        kept_detections = [detections[place] for place in selected]
-        frames.append(measure_pair(kept_detections, left, right, drive.stated, method, ground))
+        view = view_pair(finder, left, right, drive.stated, method, min_score=min_score)
+        selected = [place for place, detection in enumerate(view.detections) if detection.score >= min_score]
+        frames.append(view.sightings)
         seconds.append(time.monotonic() - started)
         if with_thesis:
-            as_thesis.append(measure_pair_as_thesis(kept_detections, left, right, drive.stated))
+            likely = [view.detections[place] for place in selected]
+            as_thesis.append(measure_pair_as_thesis(likely, left, right, drive.stated))
         total += sum(stalk.band_box is not None and stalk.band_visible >= MIN_VISIBLE for stalk in stalks)
-        outcomes.append((detections, selected, stalks))
+        outcomes.append((view.detections, selected, stalks))
     tracks, path = track_stalks(frames, drive.odometry, drive.stated)
     owners: list[list[int | None]] = []
     scored_detections: list[tuple[float, float]] = []
@@ -146,7 +145,7 @@ def score_plot(
         np.array(scored_detections).reshape(-1, 2),
         total,
         np.array(upper).reshape(-1, 2),
-        float(np.mean(seconds[1:])) if len(seconds) > 1 else math.nan,
+        float(np.median(seconds[1:])) if len(seconds) > 1 else math.nan,
         _thesis_score(as_thesis, owners, sequence) if with_thesis else None,
         np.array(errors, float),
     )

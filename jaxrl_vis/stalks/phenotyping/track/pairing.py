@@ -1,17 +1,31 @@
-"""Detection of faults of a pair that make widths wrong: swapped, upside down, unrectified, or calibrated in a wrong unit."""
+"""Views of single pairs, and faults that make their widths wrong: swapped, upside down, unrectified, or in a wrong unit."""
 
 import dataclasses
+import functools
+import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
-from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, find_ground
-from jaxrl_vis.stalks.phenotyping.measure.stalk import DEPTHS, measure_stalk, stalk_disparity
+from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, find_frame
+from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_rows, find_ground
+from jaxrl_vis.stalks.phenotyping.measure.stalk import DEPTHS, Method, measure_stalk, stalk_disparity
 from jaxrl_vis.stalks.phenotyping.measure.width import fit_strip
-from jaxrl_vis.stalks.phenotyping.track.near_row import near_row_depth
-from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sighting, to_grey_bytes
+from jaxrl_vis.stalks.phenotyping.track.near_row import MIN_STALKS, near_row_depth
+from jaxrl_vis.stalks.phenotyping.track.sightings import (
+    USUAL_DISTANCE,
+    Find,
+    Sighting,
+    measure_pair,
+    row_distance,
+    to_grey_bytes,
+)
 from jaxrl_vis_envs.plants import Calibration
 
+_OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is found at the usual one
+_SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
+_STEP = 1.06  # between the distances for which images are scaled
 _MIN_STALKS = 4
 _MIN_MEASURED = 0.7  # minimum fraction of the detections that are measured in a good pair
 _SAME_DEPTH = 0.15  # maximum relative difference of the depths of one row
@@ -19,6 +33,91 @@ _MIN_DEPTH_RATIO = 3.0  # minimum depth in baselines: below, the fields of view 
 _MIN_DISPARITY = 2.0  # pixels
 _SMALL_FRACTION, _LARGE_FRACTION = 0.25, 0.6
 _ROW_OFFSETS = (6, 12, 24, 48)  # vertical offsets of unrectified images that are tried, pixels at a focal length of 2168
+
+
+@dataclasses.dataclass(frozen=True)
+class PairView:
+    """Detections and measurements of one stereo pair.
+
+    Attributes:
+        detections: Detections in the left image.
+        sightings: Sighting of each detection that counts.
+        ground: Ground plane, the reference for heights; None if not found.
+        frame: Part of the left image without black borders.
+    """
+
+    detections: list[Detection]
+    sightings: list[Sighting]
+    ground: Ground | None
+    frame: Frame
+
+
+def view_pair(
+    find: Find,
+    left: np.ndarray,
+    right: np.ndarray,
+    calibration: Calibration | None,
+    method: Method = "strip",
+    disparity: np.ndarray | None = None,
+    min_score: float = 0.0,
+) -> PairView:
+    """Detect and measure the stalks of a pair, whose row of plants may be nearer or further away than usual.
+
+    The networks detect stalks of about one size in pixels. If stereo shows that the row is at another distance, or few stalks
+    are detected, detection is repeated with images scaled for other distances.
+
+    Args:
+        find: Stalk detector.
+        left, right: Rectified images [H, W, 3] uint8.
+        calibration: Calibration of the cameras; None if unknown.
+        method: Method of measuring widths.
+        disparity: Known disparities; see `measure_pair`.
+        min_score: Minimum score of a detection that counts.
+
+    Returns:
+        Detections and measurements at the distance that stereo confirms, or else at the usual one.
+    """
+
+    def measure(detections: list[Detection]) -> PairView:
+        likely = [detection for detection in detections if detection.score >= min_score]
+        sightings = measure_pair(likely, left, right, calibration, method, ground, disparity)
+        return PairView(detections, sightings, ground, frame)
+
+    detections, ground = _detect_with_ground(find, left, right, calibration, disparity)
+    frame = find_frame(left)
+    usual = measure(detections)
+    there = row_distance(usual.sightings)
+    if calibration is None or (there is not None and abs(there / USUAL_DISTANCE - 1.0) <= _SAME_DISTANCE):
+        return usual
+    if there is None and len(usual.sightings) >= MIN_STALKS:
+        return usual
+    for distance in _OTHER_DISTANCES if there is None else (there,):
+        band = functools.partial(band_rows, ground, calibration, distance)
+        view = measure(find(left, calibration.focal / _rounded(distance), band))
+        there = row_distance(view.sightings)
+        if there is not None and abs(there / distance - 1.0) <= _SAME_DISTANCE:
+            return view
+    return usual
+
+
+def _detect_with_ground(
+    find: Find, left: np.ndarray, right: np.ndarray, calibration: Calibration | None, disparity: np.ndarray | None
+) -> tuple[list[Detection], Ground | None]:
+    """Detect the stalks of a row at the usual distance, and find the ground plane meanwhile, in a thread on the host."""
+    if calibration is None:
+        return find(left, None, None), None
+    with ThreadPoolExecutor(1) as aside:
+        ground = aside.submit(lambda: find_ground(to_grey_bytes(left), to_grey_bytes(right), calibration, disparity))
+
+        def band(column: float) -> tuple[float, float, bool]:  # waits for the ground, but not before a detector asks
+            return band_rows(ground.result(), calibration, USUAL_DISTANCE, column)
+
+        return find(left, calibration.focal / USUAL_DISTANCE, band), ground.result()
+
+
+def _rounded(distance: float) -> float:
+    """Round a distance by 3 % at most: networks are compiled for each size of an image."""
+    return USUAL_DISTANCE * _STEP ** round(math.log(distance / USUAL_DISTANCE, _STEP))
 
 
 def pair_fault(

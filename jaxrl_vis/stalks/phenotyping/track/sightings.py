@@ -1,10 +1,8 @@
 """Sightings: the stalks detected in one stereo pair, with their measurements where possible."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, get_args, get_origin
 
 import cv2
@@ -14,8 +12,8 @@ from jaxrl_vis.config import fields
 from jaxrl_vis.stalks.phenotyping.detector.band import Band
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.measure.behind import depths_behind
-from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, find_frame
-from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_rows, find_ground
+from jaxrl_vis.stalks.phenotyping.measure.borders import find_frame
+from jaxrl_vis.stalks.phenotyping.measure.ground import Ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement, Method, measure_stalk
 from jaxrl_vis.stalks.phenotyping.measure.width import fit_strip
 from jaxrl_vis.stalks.phenotyping.track.near_row import MIN_STALKS, near_row_depth
@@ -28,9 +26,6 @@ Find = Callable[[np.ndarray, float | None, Band | None], list[Detection]]
 the band, both None if unknown."""
 USUAL_DISTANCE = 0.8
 """Default distance from the cameras to the row of plants, m."""
-_OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is found at the usual one
-_SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
-_STEP = 1.06  # between the distances for which images are scaled
 _FAR_FROM_ROW = 0.2  # m: distance from the row beyond which a match is suspicious
 # Factor of the confidence of a measurement with an edge that may be occluded; at 24 inches, fewer of these are lower bounds.
 _OCCLUSION_FACTOR, _UPPER_OCCLUSION_FACTOR = 0.1, 0.025
@@ -133,101 +128,6 @@ _KINDS = {name: _field_kind(hint) for name, hint in fields.hints(Sighting).items
 def to_grey_bytes(image: np.ndarray) -> np.ndarray:
     """Convert an RGB image [H, W, 3] uint8 to greyscale [H, W] uint8."""
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-
-
-def detect_with_ground(
-    find: Find,
-    left: np.ndarray,
-    right: np.ndarray,
-    calibration: Calibration | None,
-    disparity: np.ndarray | None = None,
-    distance: float = USUAL_DISTANCE,
-) -> tuple[list[Detection], Ground | None]:
-    """Detect the stalks of a pair and find its ground plane concurrently, the latter in a thread on the host.
-
-    Args:
-        find: Stalk detector.
-        left, right: Rectified images [H, W, 3] uint8.
-        calibration: Calibration of the cameras; None to skip the ground, and to call ``find`` without a resolution.
-        disparity: Known disparities; see `find_ground`.
-        distance: Distance from the cameras to the row of plants, m, which determines the pixels per metre there.
-
-    Returns:
-        Detections, and the ground plane, None if not found.
-    """
-    if calibration is None:
-        return find(left, None, None), None
-    with ThreadPoolExecutor(1) as aside:
-        ground = aside.submit(lambda: find_ground(to_grey_bytes(left), to_grey_bytes(right), calibration, disparity))
-
-        def band(column: float) -> tuple[float, float, bool]:  # waits for the ground, but not before a detector asks
-            return band_rows(ground.result(), calibration, distance, column)
-
-        return find(left, calibration.focal / distance, band), ground.result()
-
-
-@dataclasses.dataclass(frozen=True)
-class PairView:
-    """Detections and measurements of one stereo pair.
-
-    Attributes:
-        detections: Detections in the left image.
-        sightings: Sighting of each detection.
-        ground: Ground plane, the reference for heights; None if not found.
-        frame: Part of the left image without black borders.
-    """
-
-    detections: list[Detection]
-    sightings: list[Sighting]
-    ground: Ground | None
-    frame: Frame
-
-
-def view_pair(
-    find: Find,
-    left: np.ndarray,
-    right: np.ndarray,
-    calibration: Calibration | None,
-    method: Method = "strip",
-    disparity: np.ndarray | None = None,
-) -> PairView:
-    """Detect and measure the stalks of a pair, whose row of plants may be nearer or further away than usual.
-
-    The networks detect stalks of about one size in pixels. If stereo shows that the row is at another distance, or few stalks
-    are detected, detection is repeated with images scaled for other distances.
-
-    Args:
-        find: Stalk detector.
-        left, right: Rectified images [H, W, 3] uint8.
-        calibration: Calibration of the cameras; None if unknown.
-        method: Method of measuring widths.
-        disparity: Known disparities; see `measure_pair`.
-
-    Returns:
-        Detections and measurements at the distance that stereo confirms, or else at the usual one.
-    """
-    detections, ground = detect_with_ground(find, left, right, calibration, disparity)
-    frame = find_frame(left)
-    sightings = measure_pair(detections, left, right, calibration, method, ground, disparity)
-    usual = PairView(detections, sightings, ground, frame)
-    there = row_distance(usual.sightings)
-    if calibration is None or (there is not None and abs(there / USUAL_DISTANCE - 1.0) <= _SAME_DISTANCE):
-        return usual
-    if there is None and len(detections) >= MIN_STALKS:
-        return usual
-    for distance in _OTHER_DISTANCES if there is None else (there,):
-        band = functools.partial(band_rows, ground, calibration, distance)
-        detections = find(left, calibration.focal / _rounded(distance), band)
-        sightings = measure_pair(detections, left, right, calibration, method, ground, disparity)
-        there = row_distance(sightings)
-        if there is not None and abs(there / distance - 1.0) <= _SAME_DISTANCE:
-            return PairView(detections, sightings, ground, frame)
-    return usual
-
-
-def _rounded(distance: float) -> float:
-    """Round a distance by 3 % at most: networks are compiled for each size of an image."""
-    return USUAL_DISTANCE * _STEP ** round(math.log(distance / USUAL_DISTANCE, _STEP))
 
 
 def row_distance(sightings: list[Sighting]) -> float | None:
