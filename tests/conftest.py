@@ -20,6 +20,9 @@ if (allocator := Path(sysconfig.get_path("purelib"), "cmeel.prefix/lib/libmimall
     os.environ.setdefault("LD_PRELOAD", str(allocator))
     os.environ.setdefault("MIMALLOC_PURGE_DELAY", "-1")
 
+# Programs that tests start would compile the package's modules each time.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # Read by JAX at its first import, so set before any test module is imported.
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"jaxrl-vis-tests-{getpass.getuser()}"))
