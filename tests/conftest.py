@@ -191,7 +191,7 @@ def pytest_collection_finish() -> None:
 
 
 # Of the 65,530 that Linux gives a process by default; a compiled program takes some tens.
-_MANY_MEMORY_MAPPINGS = 20_000
+_MANY_MEMORY_MAPPINGS = 30_000
 
 
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
