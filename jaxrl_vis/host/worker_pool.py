@@ -82,7 +82,7 @@ def map_unordered(function: Callable[[A], T], arguments: Iterable[A], workers: i
 class UnorderedMap(Protocol):
     """Map of a function over arguments in this process or in several, with results in order of completion."""
 
-    def __call__(self, function: Callable[[A], T], arguments: Iterable[A]) -> Iterator[T]: ...  # noqa: D102
+    def __call__(self, function: Callable[[A], T], arguments: Iterable[A], /) -> Iterator[T]: ...  # noqa: D102
 
 
 @contextlib.contextmanager

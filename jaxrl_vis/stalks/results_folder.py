@@ -12,7 +12,7 @@ from typing import Any
 
 import jaxrl_vis
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis.host.files import is_temporary, write_atomically
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
@@ -109,6 +109,9 @@ def claim_folder(
                 f"{out} holds the results of another request ({differing}): choose another folder with --out, or remove it"
             )
     out.mkdir(parents=True, exist_ok=True)
+    for file in out.rglob(".*.tmp"):
+        if is_temporary(file.name):  # of a killed process
+            file.unlink()
     write_atomically(path, json.dumps(request, indent=2) + "\n")
 
 

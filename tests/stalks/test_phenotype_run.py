@@ -5,6 +5,7 @@ import functools
 import json
 import multiprocessing
 import os
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -109,6 +110,29 @@ def test_this_process_compiles_for_its_workers(plots, tmp_path):
     assert len(signed) == 8
     first = f"{there[0].name} {there[0].pairs[0].name}"
     assert [pair for pair, process in signed.items() if process == str(os.getpid())] == [first]
+
+
+def test_two_pairs_are_processed_at_a_time_and_an_error_ends_both(plots, tmp_path):
+    """Images of one pair are decoded while another is measured; the pairs after an error are not begun."""
+    together = threading.Barrier(2, timeout=20)
+    begun: list[tuple[str, str]] = []
+
+    def find(image: Any, pixels_per_metre: Any, band: Any, plot: Any, pair: Any) -> Any:
+        if (plot.name, pair.name) not in begun:
+            begun.append((plot.name, pair.name))
+        if len(begun) == 1:  # processed alone, and more than once, as nothing is detected
+            return []
+        if len(begun) <= 3:
+            together.wait()
+        else:
+            time.sleep(0.5)
+        raise ValueError("stop here")
+
+    there = find_plots(plots)
+    calibrations = {plot.name: read_calibration(plots / plot.name / "calibration.yaml") for plot in there}
+    with pytest.raises(ValueError, match="stop here"):
+        pipeline.run(there, find, Request(tmp_path / "out", "strip", "nobody", calibrations))
+    assert 3 <= len(begun) < 8
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,11 @@
 XLA's CPU fusion emitters recompute a deep kinematic chain once for every use, which makes MuJoCo's forward kinematics hundreds
 of times slower on a CPU. They are disabled here per function, never by environment variable, because a notebook initialises JAX
 long before this package is imported. XLA also delegates small sums to a library with its own threads (YNNPACK), although the
-call takes longer than the sum: without it, FetchReach in 16 environments is simulated 1.3 times as fast on two cores, and
-gradient steps take up to a seventh less time.
+call takes longer than the sum (docs/lab/physics_parity.md).
 
 JAX 0.11 no longer has this option per function (it rejects the name). Its emitters do not have this problem, but run physics on
-a CPU about half as fast (FetchReach, 64 environments, two cores: 1,100 environment steps per second against 2,350). `make` and
-the notebooks therefore install 0.10 where there is no GPU (requirements/cpu.in).
+a CPU about half as fast (docs/lab/physics_parity.md). `make` and the notebooks therefore install 0.10 where there is no GPU
+(requirements/cpu.in).
 
 On a GPU the many small kernels of a gradient step are launched together, as a CUDA graph. By default XLA chains them; here
 independent kernels may run concurrently, which makes gradient steps a tenth to a fifth faster (docs/lab/gradient_step.md).

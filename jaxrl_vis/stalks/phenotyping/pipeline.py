@@ -13,9 +13,8 @@ Each process has one pair in memory at a time, and this one up to eight images t
 
 import dataclasses
 import functools
-import itertools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -138,8 +137,12 @@ def run(
             f"{request.lens_range.pixels_per_metre:.0f} pixels or more per metre of the row and "
             f"{request.lens_range.view:.2f} m of it from top to bottom; on no real row."
         )
-    with worker_pool(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
-        return _run(plots, find, request, distances, page, done, echo, run_all)
+    threads = ThreadPoolExecutor(2)  # decode the images of one pair while another is measured
+    try:
+        with worker_pool(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
+            return _run(plots, find, request, distances, page, done, echo, run_all if workers > 1 else threads.map)
+    finally:
+        threads.shutdown(cancel_futures=True)
 
 
 def _run(
@@ -167,9 +170,14 @@ def _run(
         if len(outdated) < pairs[plot.name]:
             done(plot.name, pairs[plot.name] - len(outdated), pairs[plot.name])
     make_record = functools.partial(_pair_record, find, request)
-    # The first pair is processed here, which compiles for all: each worker would compile the same with a fraction of the cores.
-    # Workers go on with the next plots while this process finishes one.
-    made = itertools.chain(map(make_record, missing[:1]), run_all(make_record, missing[1:]))
+
+    def make_all() -> Iterator[tuple[str, str, dict[str, Any], Any]]:
+        # This compiles for all: each worker would do so with fewer cores.
+        yield from map(make_record, missing[:1])
+        # These go on with the next plots while one is finished.
+        yield from run_all(make_record, missing[1:])
+
+    made = make_all()
     for plot in plots:
         while left[plot.name]:
             name, pair, record, sources = next(made)
