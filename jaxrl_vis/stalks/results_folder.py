@@ -109,9 +109,10 @@ def claim_folder(
                 f"{out} holds the results of another request ({differing}): choose another folder with --out, or remove it"
             )
     out.mkdir(parents=True, exist_ok=True)
-    for file in out.rglob(".*.tmp"):
-        if is_temporary(file.name):  # of a killed process
-            file.unlink()
+    for folder in (out, out / "runs", *out.glob("pairs/*"), *out.glob("overlays/*")):  # a run may train in others
+        for file in folder.glob(".*.tmp"):
+            if is_temporary(file.name):  # of a killed process
+                file.unlink()
     write_atomically(path, json.dumps(request, indent=2) + "\n")
 
 

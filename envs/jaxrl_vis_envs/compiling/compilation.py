@@ -5,9 +5,8 @@ of times slower on a CPU. They are disabled here per function, never by environm
 long before this package is imported. XLA also delegates small sums to a library with its own threads (YNNPACK), although the
 call takes longer than the sum (docs/lab/physics_parity.md).
 
-JAX 0.11 no longer has this option per function (it rejects the name). Its emitters do not have this problem, but run physics on
-a CPU about half as fast (docs/lab/physics_parity.md). `make` and the notebooks therefore install 0.10 where there is no GPU
-(requirements/cpu.in).
+JAX 0.11 no longer has this option per function, and its emitters run physics on a CPU about half as fast
+(docs/lab/physics_parity.md). `make` and the notebooks therefore install 0.10 where there is no GPU (requirements/cpu.in).
 
 On a GPU the many small kernels of a gradient step are launched together, as a CUDA graph. By default XLA chains them; here
 independent kernels may run concurrently, which makes gradient steps a tenth to a fifth faster (docs/lab/gradient_step.md).

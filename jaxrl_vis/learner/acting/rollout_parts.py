@@ -2,8 +2,7 @@
 
 A GPU steps all environments at once, and so do several devices. One CPU steps at most `PART_SIZE` at a time, in as many threads
 as it has cores (`jaxrl_vis.run.compiled.threaded_rollout`): XLA would divide single operations among its threads, and those of
-a physics step are too small for that. An evaluation calls the same program, so that physics and rendering, which take longest
-to compile, are compiled only once.
+a physics step are too small for that. An evaluation calls the same program, as physics and rendering take longest to compile.
 """
 
 import dataclasses

@@ -100,7 +100,7 @@ def run(
 
     Args:
         plots: Folders of pairs.
-        find: Stalk detector; must be picklable if there is more than one worker.
+        find: Stalk detector, called in two threads; picklable for several workers.
         request: Options of the run.
         done: Progress callback, called after each pair with the plot's name, and the numbers of finished and of all its pairs.
         workers: Number of processes that measure pairs, except for the first one; 1 to use the calling process.

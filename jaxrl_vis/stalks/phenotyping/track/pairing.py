@@ -23,16 +23,16 @@ from jaxrl_vis.stalks.phenotyping.track.sightings import (
 )
 from jaxrl_vis_envs.plants import Calibration
 
-_OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is found at the usual one
+_OTHER_DISTANCES = (0.55, 1.15)  # m: tried if no row is found at the usual one
 _SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
-_STEP = 1.06  # between the distances for which images are scaled
+_STEP = 1.06  # between distances for which images are scaled
 _MIN_STALKS = 4
-_MIN_MEASURED = 0.7  # minimum fraction of the detections that are measured in a good pair
-_SAME_DEPTH = 0.15  # maximum relative difference of the depths of one row
+_MIN_MEASURED = 0.7  # minimum fraction of detections measured in a good pair
+_SAME_DEPTH = 0.15  # maximum relative difference of depths of one row
 _MIN_DEPTH_RATIO = 3.0  # minimum depth in baselines: below, the fields of view hardly overlap
 _MIN_DISPARITY = 2.0  # pixels
 _SMALL_FRACTION, _LARGE_FRACTION = 0.25, 0.6
-_ROW_OFFSETS = (6, 12, 24, 48)  # vertical offsets of unrectified images that are tried, pixels at a focal length of 2168
+_ROW_OFFSETS = (6, 12, 24, 48)  # vertical offsets that are tried, pixels at a focal length of 2168
 
 
 @dataclasses.dataclass(frozen=True)
