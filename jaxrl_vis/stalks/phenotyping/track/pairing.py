@@ -23,8 +23,8 @@ from jaxrl_vis.stalks.phenotyping.track.sightings import (
 )
 from jaxrl_vis_envs.plants import Calibration
 
-_OTHER_DISTANCES = (0.55, 1.15)  # m: tried if no row is found at the usual one
-_SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
+_OTHER_DISTANCES = (0.55, 1.15)  # m: tried if there is no row at the usual one
+_SAME_DISTANCE = 0.12  # relative: tolerance of the networks to sizes
 _STEP = 1.06  # between distances for which images are scaled
 _MIN_STALKS = 4
 _MIN_MEASURED = 0.7  # minimum fraction of detections measured in a good pair
@@ -75,7 +75,7 @@ def view_pair(
         min_score: Minimum score of a detection that counts.
 
     Returns:
-        Detections and measurements at the distance that stereo confirms, or else at the usual one.
+        View at the distance that stereo confirms, or else at the usual one.
     """
 
     def measure(detections: list[Detection]) -> PairView:
