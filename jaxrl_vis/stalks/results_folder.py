@@ -74,8 +74,7 @@ def claim_folder(
 ) -> None:
     """Write the request to its results folder, and check that the results there belong to the same request.
 
-    A folder without results may be claimed for another request, and a plot without a calibration may get one later, as error
-    messages suggest.
+    A folder without results may be claimed for another request. A plot may get its calibration later.
 
     Args:
         out: The folder; created if missing.
@@ -83,7 +82,7 @@ def claim_folder(
         folders: Folders of pairs.
         calibrations: Calibration of each folder by name; None if there is none.
         about: Everything else that results depend on, as JSON.
-        begun: True if the folder holds results; if not, its request is replaced unchecked.
+        begun: True if the folder holds results; if not, its request is replaced.
 
     Raises:
         RequestError: The folder holds the results of another request.
@@ -111,8 +110,9 @@ def claim_folder(
     out.mkdir(parents=True, exist_ok=True)
     for folder in (out, out / "runs", *out.glob("pairs/*"), *out.glob("overlays/*")):  # a run may train in others
         for file in folder.glob(".*.tmp"):
-            if is_temporary(file.name):  # of a killed process
-                file.unlink()
+            process = file.name[1:].partition("-")[0]
+            if is_temporary(file.name) and not Path("/proc", process).exists():  # of a killed process
+                file.unlink(missing_ok=True)
     write_atomically(path, json.dumps(request, indent=2) + "\n")
 
 

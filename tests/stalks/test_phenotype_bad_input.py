@@ -230,12 +230,17 @@ def test_a_run_that_was_killed_gives_the_same_tables(plots, results, tmp_path, c
     assert program.wait() == -signal.SIGKILL
     assert not (out / "plots.csv").exists() or len(list(out.glob("pairs/*/*.json"))) < 8
     for folder in ("pairs/plot_0000", "."):
-        (out / folder / ".1-0123456789abcdef.tmp").touch()  # as if killed while writing
+        (out / folder / f".{program.pid}-0123456789abcdef.tmp").touch()  # as if killed while writing
     training = tmp_path / "out" / "runs" / "seed0" / ".1-0123456789abcdef.tmp"
     training.parent.mkdir(parents=True)
     training.touch()
+    writing = out / f".{os.getpid()}-0123456789abcdef.tmp"
+    writing.touch()
     assert run(plots, out) == 0
     training.unlink()  # another program's, which may be writing it
+    if sys.platform == "linux":
+        assert writing.exists()  # a living process's
+        writing.unlink()
     for name in ("stalks.csv", "plots.csv", "skipped.csv", "qc.html"):
         assert (out / name).read_bytes() == (results / name).read_bytes()
     assert not list(out.rglob("*.tmp"))

@@ -7,8 +7,8 @@
         stalks.csv  plots.csv  skipped.csv
         qc.html                  the same with images, and what was rejected
 
-Tables are always derived from the files under pairs/, so they depend neither on interruptions nor on the number of processes.
-Each process has one pair in memory at a time, and this one up to eight images to draw overlays on.
+Tables are derived from the files under pairs/, so they depend neither on interruptions nor on the number of processes.
+A single process has two pairs in memory, several have one each, and this one up to eight images for overlays.
 """
 
 import dataclasses
@@ -102,7 +102,7 @@ def run(
         plots: Folders of pairs.
         find: Stalk detector, called in two threads; picklable for several workers.
         request: Options of the run.
-        done: Progress callback, called after each pair with the plot's name, and the numbers of finished and of all its pairs.
+        done: Callback for each pair, with the plot's name, and the numbers of finished and of all its pairs.
         workers: Number of processes that measure pairs, except for the first one; 1 to use the calling process.
         echo: Callback for each plot without a count, with its name and the reason.
 
@@ -172,9 +172,9 @@ def _run(
     make_record = functools.partial(_pair_record, find, request)
 
     def make_all() -> Iterator[tuple[str, str, dict[str, Any], Any]]:
-        # This compiles for all: each worker would do so with fewer cores.
+        # This compiles for all workers: each of them has fewer cores.
         yield from map(make_record, missing[:1])
-        # These go on with the next plots while one is finished.
+        # They go on while a plot is finished.
         yield from run_all(make_record, missing[1:])
 
     made = make_all()
