@@ -22,7 +22,7 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from jaxrl_vis.errors import RequestError, WorkerError, is_out_of_memory
 from jaxrl_vis.host.files import is_count, read_json, write_atomically
@@ -79,10 +79,8 @@ def map_unordered(function: Callable[[A], T], arguments: Iterable[A], workers: i
         yield from unordered_map(function, arguments)
 
 
-class UnorderedMap(Protocol):
-    """Map of a function over arguments in this process or in several, with results in order of completion."""
-
-    def __call__(self, function: Callable[[A], T], arguments: Iterable[A], /) -> Iterator[T]: ...  # noqa: D102
+UnorderedMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
+"""Map of a function over arguments, in this process as results are needed, or at once in several, as they complete."""
 
 
 @contextlib.contextmanager
@@ -119,6 +117,9 @@ def worker_pool(workers: int) -> Iterator[UnorderedMap]:
         arguments = iter(arguments)
         # Two pending calls per worker, so that none waits for this process.
         waiting = {submit(function, argument) for argument in itertools.islice(arguments, 2 * workers)}
+        return results(function, arguments, waiting)
+
+    def results(function: Callable[[A], T], arguments: Iterator[A], waiting: set[Future[T]]) -> Iterator[T]:
         while waiting:
             ready, waiting = wait(waiting, _CHECK_INTERVAL, FIRST_COMPLETED)
             if not ready and any(child.exitcode for child in children):

@@ -21,7 +21,7 @@ import pytest
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError, Terminated, WorkerError
 from jaxrl_vis.host import devices
-from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all, map_unordered
+from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all, map_unordered, worker_pool
 from jaxrl_vis.run import signals
 from jaxrl_vis_envs.cores import num_cores
 
@@ -178,6 +178,13 @@ def test_endless_numbers_are_taken_as_they_are_needed(workers: int):
     assert set(some) <= {number**2 + 1 for number in range(12)} and len(set(some)) == 5
     assert workers == 2 or some == [1, 2, 5, 10, 17]
     assert not set(multiprocessing.active_children()) - before
+
+
+def test_processes_begin_before_the_first_result_is_asked_for(tmp_path: Path):
+    with worker_pool(2) as unordered_map:
+        results = unordered_map(Path.touch, [tmp_path / "begun"])
+        wait_until((tmp_path / "begun").exists, 60.0)
+        assert list(results) == [None]
 
 
 def test_what_goes_wrong_with_endless_numbers_is_reported():

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from phenotype_plots import run, table
+from test_worker_pool import wait_until
 
 from jaxrl_vis import cli
 from jaxrl_vis.stalks.cli.options import PlantOptions
@@ -110,6 +111,32 @@ def test_this_process_compiles_for_its_workers(plots, tmp_path):
     assert len(signed) == 8
     first = f"{there[0].name} {there[0].pairs[0].name}"
     assert [pair for pair, process in signed.items() if process == str(os.getpid())] == [first]
+
+
+class FindsOnceAWorkerIsThere:
+    """Detector of nothing that returns in the calling process once a worker has received it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ = state
+        (self._folder / str(os.getpid())).touch()
+
+    def __call__(self, image: Any, pixels_per_metre: Any, band: Any, plot: Any, pair: Any) -> list:
+        if multiprocessing.parent_process() is None:
+            wait_until(lambda: any(self._folder.iterdir()), 60.0)
+        return []
+
+
+def test_workers_start_while_this_process_compiles(plots, tmp_path):
+    (there, *_), received = find_plots(plots), tmp_path / "received"
+    received.mkdir()
+    calibrations = {there.name: read_calibration(plots / there.name / "calibration.yaml")}
+    there = dataclasses.replace(there, pairs=there.pairs[:2])
+    request = Request(tmp_path / "out", "strip", "nobody", calibrations)
+    pipeline.run([there], FindsOnceAWorkerIsThere(received), request, workers=8)
+    assert len(list(received.iterdir())) == 1  # one pair is left, and needs no more
 
 
 def test_two_pairs_are_processed_at_a_time_and_an_error_ends_both(plots, tmp_path):

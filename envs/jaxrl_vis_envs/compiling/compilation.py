@@ -5,15 +5,14 @@ of times slower on a CPU. They are disabled here per function, never by environm
 long before this package is imported. XLA also delegates small sums to a library with its own threads (YNNPACK), although the
 call takes longer than the sum (docs/lab/physics_parity.md).
 
-JAX 0.11 no longer has this option per function, and its emitters run physics on a CPU about half as fast
-(docs/lab/physics_parity.md). `make` and the notebooks therefore install 0.10 where there is no GPU (requirements/cpu.in).
+JAX 0.11 no longer has this option per function, and runs physics on a CPU about half as fast: `make` and the notebooks install
+0.10 where there is no GPU (requirements/cpu.in).
 
 On a GPU the many small kernels of a gradient step are launched together, as a CUDA graph. By default XLA chains them; here
 independent kernels may run concurrently, which makes gradient steps a tenth to a fifth faster (docs/lab/gradient_step.md).
 
-XLA also autotunes the tile of every matrix product there, by compiling and timing some thirty kernels per product. That took
-four fifths of the compilation time of gradient steps, for steps no faster than with one tile for all products, `_TILE`. XLA
-still chooses NVIDIA's own kernels where they are faster.
+All matrix products there have one tile, `_TILE`, unless NVIDIA's own kernels are faster: XLA would compile and time some thirty
+kernels for each, in four fifths of the compilation time of gradient steps, which became no faster.
 
 Code that is fast on a CPU is slow on a GPU and vice versa, and some functions have a hand-written kernel for NVIDIA GPUs
 (Pallas, by Triton). The choice follows the platform that a program is compiled for, which is not always the default backend

@@ -19,6 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import jaxrl_vis
@@ -140,7 +141,7 @@ def run(
     threads = ThreadPoolExecutor(2)  # decode the images of one pair while another is measured
     try:
         with worker_pool(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
-            return _run(plots, find, request, distances, page, done, echo, run_all if workers > 1 else threads.map)
+            return _run(plots, find, request, distances, page, done, echo, workers, run_all if workers > 1 else threads.map)
     finally:
         threads.shutdown(cancel_futures=True)
 
@@ -153,6 +154,7 @@ def _run(
     page: Page,
     done: Callable[[str, int, int], None],
     echo: Callable[[str, str], None],
+    workers: int,
     run_all: UnorderedMap,
 ) -> tuple[list[Row], list[Row]]:
     """Process plots; return the rows of plots.csv and skipped.csv. See `run` for the arguments."""
@@ -172,9 +174,9 @@ def _run(
     make_record = functools.partial(_pair_record, find, request)
 
     def make_all() -> Iterator[tuple[str, str, dict[str, Any], Any]]:
-        # This compiles for all workers: each of them has fewer cores.
+        run_all(functools.partial(_start_worker, find), range(min(workers, len(missing) - 1)))
+        # While workers start, this compiles for all of them: each has fewer cores.
         yield from map(make_record, missing[:1])
-        # They go on while a plot is finished.
         yield from run_all(make_record, missing[1:])
 
     made = make_all()
@@ -200,6 +202,11 @@ def _run(
         write_rows(request.out / "skipped.csv", SKIPPED_COLUMNS, skipped)
     page.write(request.out / "qc.html", skipped)
     return rows, skipped
+
+
+def _start_worker(find: Find, number: int) -> None:
+    """Initialise JAX in a worker that has imported the detector to receive this call."""
+    jax.devices()
 
 
 def _missing_count_reason(flag: str, frames: list[list[Sighting]], plot: PlotFolder, distances: dict[str, float] | None) -> str:

@@ -42,9 +42,7 @@ class Trait:
     is_integer: bool = False
 
 
-# Diameters have the Plant Trait Ontology's term for stem thickness. Stalk numbers have none: the Crop Ontology of sorghum
-# (CO_324) counts plants, hills, panicles and the tillers of a plant, and the Plant Trait Ontology tillers (TO:0000346), but
-# neither counts main stems and tillers of a plot together. `--term` sets the term that a breeding programme uses.
+# Diameters have the Plant Trait Ontology's term for stem thickness. Stalk numbers have none (docs/phenotyping.md).
 _DIAMETER = "TO:0000339"
 TRAITS = (
     Trait("stalks", "stalk number", "1", "count in the plot", is_integer=True),
