@@ -62,7 +62,6 @@ Find = Callable[[np.ndarray, float | None, Band | None, PlotFolder, PairFiles], 
 band (None if unknown), and its folder and files; returns the detections in pixels of the image."""
 NO_ODOMETRY = "no odometry"
 NO_FIT = "odometry does not fit the images"
-_OVERLAYS_AT_ONCE = 8
 SKIPPED_COLUMNS = ("plot", "pair", "why")
 
 
@@ -138,12 +137,15 @@ def run(
             f"{request.lens_range.pixels_per_metre:.0f} pixels or more per metre of the row and "
             f"{request.lens_range.view:.2f} m of it from top to bottom; on no real row."
         )
-    threads = ThreadPoolExecutor(2)  # decode the images of one pair while another is measured
+    # To decode images and to draw overlays is OpenCV's work, which lets other threads run.
+    threads, drawing = ThreadPoolExecutor(2), ThreadPoolExecutor(8)
     try:
         with worker_pool(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
-            return _run(plots, find, request, distances, page, done, echo, workers, run_all if workers > 1 else threads.map)
+            run_all = run_all if workers > 1 else threads.map
+            return _run(plots, find, request, distances, page, done, echo, workers, run_all, drawing)
     finally:
         threads.shutdown(cancel_futures=True)
+        drawing.shutdown(cancel_futures=True)
 
 
 def _run(
@@ -156,6 +158,7 @@ def _run(
     echo: Callable[[str, str], None],
     workers: int,
     run_all: UnorderedMap,
+    drawing: ThreadPoolExecutor,
 ) -> tuple[list[Row], list[Row]]:
     """Process plots; return the rows of plots.csv and skipped.csv. See `run` for the arguments."""
     stalks: list[Row] = []
@@ -180,6 +183,7 @@ def _run(
         yield from run_all(make_record, missing[1:])
 
     made = make_all()
+    unfinished: list[Callable[[], None]] = []
     for plot in plots:
         while left[plot.name]:
             name, pair, record, sources = next(made)
@@ -195,11 +199,15 @@ def _run(
         result = _finish_plot(plot, records, distances[plot.name], request)
         if result.row["stalks"] == "":
             echo(plot.name, result.row["flag"] + (f" ({result.count_reason})" if result.count_reason else ""))
-        page.add(result)
         stalks, rows, skipped = stalks + result.stalks, [*rows, result.row], skipped + bad
         write_rows(request.out / "stalks.csv", STALK_COLUMNS, stalks)
         write_rows(request.out / "plots.csv", PLOT_COLUMNS, rows)
         write_rows(request.out / "skipped.csv", SKIPPED_COLUMNS, skipped)
+        unfinished.append(_draw_overlays(plot, records, result, request, page, drawing))
+        if len(unfinished) > 1:
+            unfinished.pop(0)()  # the plot before, whose overlays were drawn while the pairs of this one were measured
+    for finish in unfinished:
+        finish()
     page.write(request.out / "qc.html", skipped)
     return rows, skipped
 
@@ -306,14 +314,7 @@ def _make_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles
 def _finish_plot(
     plot: PlotFolder, records: list[dict[str, Any]], distances: dict[str, float] | None, request: Request
 ) -> PlotResult:
-    """Track the stalks of a plot, compute its table rows, and render its overlays.
-
-    Args:
-        plot: Folder of the plot.
-        records: Record of each pair.
-        distances: Distance driven at each pair by the pair's name, m; None if unknown.
-        request: Options of the run.
-    """
+    """Track the stalks of a plot, and compute its table rows, from the records of its pairs and the distances driven, m."""
     usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
     skipped = len(records) - len(usable)
     frames = [[Sighting.read(values) for values in record["sightings"]] for _, record in usable]
@@ -321,7 +322,6 @@ def _finish_plot(
     calibration = request.calibrations[plot.name]
     known = distances is not None and all(pair.name in distances for pair, _ in usable)
     flag, tracks, start = _tracking_fault(len(usable), calibration), [], 0.0
-    labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
     drive = None
     why = _lens_fault(request, frames, [record for _, record in usable], plot.name)
     if why is not None:
@@ -335,13 +335,11 @@ def _finish_plot(
         stalks, row = rows_without_path(frames, skipped, origin, flag, metric=flag not in (NO_FIT, UNTRIED))
     else:
         tracks, path = drive.tracks, drive.path
-        labels = sighting_labels(frames, tracks)
         start = float(path.positions[0])
         stalks, row = plot_rows(frames, tracks, path, skipped, origin)
     strange = _unfamiliar_note([record for _, record in usable])
     if strange:
         row = {**row, "flag": UNFAMILIAR if row["flag"] == "ok" else f"{row['flag']}; {UNFAMILIAR}"}
-    _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels)
     width = usable[0][1]["size"][1] if usable else 0
     why = why or (_missing_count_reason(row["flag"], frames, plot, distances) if row["stalks"] == "" else "")
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width, why, strange)
@@ -361,12 +359,20 @@ def _unfamiliar_note(records: list[dict[str, Any]]) -> str:
 
 
 def _draw_overlays(
-    plot: str,
-    folder: Path,
-    usable: list[tuple[PairFiles, dict[str, Any]]],
-    labels: list[list[str | None]],
-) -> None:
-    """Write the overlays of a plot that are missing or outdated, and delete those of pairs that are no longer usable."""
+    plot: PlotFolder,
+    records: list[dict[str, Any]],
+    result: PlotResult,
+    request: Request,
+    page: Page,
+    threads: ThreadPoolExecutor,
+) -> Callable[[], None]:
+    """Begin to write the overlays of a plot that are missing or outdated, and delete those of pairs that are no longer usable.
+
+    The function that is returned waits for them, and adds the plot to the page.
+    """
+    usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
+    labels = sighting_labels(result.frames, result.tracks)
+    folder = request.out / "overlays" / file_name(plot.name)
     folder.mkdir(parents=True, exist_ok=True)
     index = folder / "drawn.json"
     shown = {pair.name: value_digest([record, names]) for (pair, record), names in zip(usable, labels)}
@@ -385,11 +391,16 @@ def _draw_overlays(
         # Drop outdated digests before rendering, so that an interruption leaves no overlay with a wrong digest.
         current = {name: digest for name, digest in drawn.items() if digest == shown.get(name)}
         write_atomically(index, json.dumps(current) + "\n")
-    with ThreadPoolExecutor(_OVERLAYS_AT_ONCE) as threads:  # nearly all of it is OpenCV's work, which lets others run
-        for _ in threads.map(functools.partial(_draw_overlay, plot), missing):
+    written = threads.map(functools.partial(_draw_overlay, plot.name), missing)
+
+    def finish() -> None:
+        for _ in written:
             pass
-    if drawn != shown:
-        write_atomically(index, json.dumps(shown) + "\n")
+        if drawn != shown:
+            write_atomically(index, json.dumps(shown) + "\n")
+        page.add(result)
+
+    return finish
 
 
 def _draw_overlay(plot: str, job: tuple[Path, PairFiles, list[Sighting], list[str | None]]) -> None:

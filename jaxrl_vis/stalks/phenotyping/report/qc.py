@@ -13,6 +13,7 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 _MAX_PAIR_IMAGES = 200  # images of whole pairs on the page
 _MAX_WHOLE, _MIN_WHOLE = 8, 1  # per plot
 _MAX_THUMBNAIL_WIDTH = 844  # pixels, maximum width of these
+_READ_AT_ONCE = 8  # overlays
 _STALK_COLUMNS = {
     "stalk": "stalk",
     "position_m": "position, m",
@@ -131,15 +133,15 @@ class Page:
         name = plot.row["plot"]
         rejected = [track for track in plot.tracks if not track.counted]
         self._rows.append({**plot.row, "rejected": len(rejected) if plot.tracks else ""})
-        pictures = _Pictures(self._overlays / file_name(name), plot)
+        pictures, pairs = _cut_pictures(self._overlays / file_name(name), plot, self._whole)
         counted = [track for track in plot.tracks if track.counted]
         tables = [
-            {"picture": pictures.track_image(track), **{column: row[column] for column in _STALK_COLUMNS}}
+            {"picture": pictures[id(track)], **{column: row[column] for column in _STALK_COLUMNS}}
             for track, row in zip(counted, plot.stalks)
         ]
         others = [
             {
-                "picture": pictures.track_image(track),
+                "picture": pictures[id(track)],
                 "position, m": f"{track.position_m - plot.start:.3f}",
                 "depth, m": "" if math.isnan(track.depth_m) else f"{track.depth_m:.3f}",
                 "pairs": len(track.sightings),
@@ -166,7 +168,7 @@ class Page:
                 f"<h3>Detections without a width, of {total} in single pairs</h3>"
                 + html_table({"why": "why", "finds": "detections"}, finds)
             )
-        write("<h3>Pairs</h3>" + "".join(pictures.pair_images(self._whole)) + "</details>\n")
+        write("<h3>Pairs</h3>" + pairs + "</details>\n")
 
     def write(self, path: Path, skipped: list[dict[str, Any]]) -> None:
         """Write the page atomically.
@@ -242,66 +244,48 @@ def html_table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
     return f"<div class=wide><table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
 
 
-class _Pictures:
-    """Images of a plot, cropped from its overlays, of which only one is in memory at a time.
+def _cut_pictures(folder: Path, plot: PlotResult, count: int) -> tuple[dict[int, _Html], str]:
+    """Crop images of a plot from the overlays in a folder, each of which is read once, several at a time.
 
-    Args:
-        folder: Folder of the plot's overlays.
-        plot: The plot.
-
-    Raises:
-        OSError: An overlay cannot be read.
+    Returns:
+        Best sighting of each track by its ``id``: one with a width, if any, and with maximum confidence; and elements with at
+        most ``count`` whole pairs, spread evenly.
     """
+    best: dict[int, list[tuple[int, Sighting]]] = {}  # by pair
+    for track in plot.tracks:
+        choices = [(frame, plot.frames[frame][place]) for frame, place in track.sightings]
+        frame, sighting = max(choices, key=lambda choice: (choice[1].diameter_mm is not None, choice[1].confidence))
+        best.setdefault(frame, []).append((id(track), sighting))
+    last = len(plot.pairs) - 1
+    whole = set(np.linspace(0, last, min(count, last + 1)).round().astype(int).tolist())
+    stalks: dict[int, _Html] = {}
 
-    def __init__(self, folder: Path, plot: PlotResult) -> None:
-        self._folder, self._plot = folder, plot
-        # The best sighting of each track, grouped by pair, so that each overlay is read once.
-        wanted: dict[int, list[tuple[int, int]]] = {}
-        for place, track in enumerate(plot.tracks):
-            frame, sighting = max(track.sightings, key=lambda indices: self._clear_section(*indices))
-            wanted.setdefault(frame, []).append((place, sighting))
-        self._crops: dict[int, _Html] = {}
-        for frame, tracks in wanted.items():
-            overlay = read_image(folder / file_name(f"{plot.pairs[frame]}.png"))
-            for place, sighting in tracks:
-                name = f"pair {plot.pairs[frame]}"
-                self._crops[place] = html_image(self._crop(overlay, plot.frames[frame][sighting]), name, "stalk")
+    def read_pair(frame: int) -> str:
+        name = f"pair {plot.pairs[frame]}"
+        overlay = read_image(folder / file_name(f"{plot.pairs[frame]}.png"))
+        for track, sighting in best.get(frame, []):
+            stalks[track] = html_image(_crop(overlay, sighting, overlay_scale(plot.image_width)), name, "stalk")
+        if frame not in whole:
+            return ""
+        shrink = min(_MAX_THUMBNAIL_WIDTH / overlay.shape[1], 1.0)
+        small = cv2.resize(overlay, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+        return f"<figure>{html_image(small, name, 'pair')}<figcaption>{_escape(name)}</figcaption></figure>"
 
-    def _clear_section(self, frame: int, sighting: int) -> tuple[bool, float]:
-        chosen = self._plot.frames[frame][sighting]
-        return chosen.diameter_mm is not None, chosen.confidence
+    with ThreadPoolExecutor(_READ_AT_ONCE) as threads:
+        pairs = "".join(threads.map(read_pair, sorted(best.keys() | whole)))
+    return stalks, pairs
 
-    def _crop(self, overlay: np.ndarray, sighting: Sighting) -> np.ndarray:
-        scale = overlay_scale(self._plot.image_width)
-        left, top, right, bottom = (round(edge * scale) for edge in sighting.box)
-        margin = max((bottom - top) // 2, 12)
-        top, bottom = max(top - margin // 2, 0), min(bottom + margin // 4, overlay.shape[0])
-        left, right = max(left - margin, 0), min(right + margin, overlay.shape[1])
-        cut = overlay[top:bottom, left:right]
-        shrink = min(240 / max(cut.shape[0], 1), 1.0)
-        return (
-            cv2.resize(cut, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-            if cut.size
-            else np.zeros((8, 8, 3), np.uint8)
-        )
 
-    def track_image(self, track: Track) -> _Html:
-        """Return the image of a track's best sighting: one with a width, if any, and with maximum confidence."""
-        return self._crops[next(index for index, other in enumerate(self._plot.tracks) if other is track)]
-
-    def pair_images(self, count: int) -> Iterable[str]:
-        """Yield HTML elements with the overlays of at most ``count`` whole pairs, spread evenly over the plot.
-
-        Raises:
-            OSError: An overlay cannot be read.
-        """
-        pairs = self._plot.pairs
-        for place in np.unique(np.linspace(0, len(pairs) - 1, min(count, len(pairs))).round()).astype(int):
-            overlay = read_image(self._folder / file_name(f"{pairs[place]}.png"))
-            shrink = min(_MAX_THUMBNAIL_WIDTH / overlay.shape[1], 1.0)
-            small = cv2.resize(overlay, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-            name = f"pair {pairs[place]}"
-            yield f"<figure>{html_image(small, name, 'pair')}<figcaption>{_escape(name)}</figcaption></figure>"
+def _crop(overlay: np.ndarray, sighting: Sighting, scale: float) -> np.ndarray:
+    left, top, right, bottom = (round(edge * scale) for edge in sighting.box)
+    margin = max((bottom - top) // 2, 12)
+    top, bottom = max(top - margin // 2, 0), min(bottom + margin // 4, overlay.shape[0])
+    left, right = max(left - margin, 0), min(right + margin, overlay.shape[1])
+    cut = overlay[top:bottom, left:right]
+    shrink = min(240 / max(cut.shape[0], 1), 1.0)
+    return (
+        cv2.resize(cut, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA) if cut.size else np.zeros((8, 8, 3), np.uint8)
+    )
 
 
 def html_image(image: np.ndarray, name: str, css_class: str) -> _Html:
