@@ -276,7 +276,7 @@ def test_brax_environments_under_brax_wrappers(backend: str) -> None:
     state = jaxrl_vis_envs.jit(wrapped.step)(first, jnp.ones((2, 1)))
     # What a step returns can be stepped again.
     again = jax.eval_shape(wrapped.step, state, jnp.ones((2, 1)))
-    assert jax.tree.map(jnp.shape, again) == jax.tree.map(jnp.shape, state)
+    assert list(map(jnp.shape, jax.tree.leaves(again))) == list(map(jnp.shape, jax.tree.leaves(state)))
     assert isinstance(state, brax.envs.State) and state.done.all()
     # The episode began anew, where the first one did.
     np.testing.assert_array_equal(state.obs["pixels/free"], first.obs["pixels/free"])
