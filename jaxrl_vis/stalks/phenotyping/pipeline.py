@@ -7,7 +7,7 @@
         stalks.csv  plots.csv  skipped.csv
         qc.html                  the same with images, and what was rejected
 
-Tables are derived from the files under pairs/, so they depend neither on interruptions nor on the number of processes.
+Tables are derived from the files under pairs/: interruptions and the number of processes change only rounding.
 A single process has two pairs in memory, several have one each, and this one up to eight images for overlays.
 """
 
