@@ -39,7 +39,7 @@ class Record:
         """The seeds, ascending."""
         return sorted({row["seed"] for row in self.rows})
 
-    @property
+    @functools.cached_property
     def end(self) -> int:
         """Environment steps of the last evaluation."""
         return max(row["env_steps"] for row in self.rows)
