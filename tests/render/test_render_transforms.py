@@ -122,6 +122,8 @@ from test_render_transforms import image, setting
 import jaxrl_vis_envs
 from jax.sharding import PartitionSpec
 assert len(jax.devices()) == 2
+if jax.__version_info__ >= (0, 11):  # see docs/scaling.md
+    jax.config.update("jax_use_shardy_partitioner", False)
 heights = np.linspace(0.0, 0.3, 4, dtype=np.float32)
 mesh = jax.sharding.Mesh(np.array(jax.devices()), ("envs",))
 spec = PartitionSpec("envs")
