@@ -11,7 +11,8 @@ PRESET ?= auto
 RUN_DIR ?= runs/seed$(SEED)-$(shell date +%Y%m%d-%H%M%S)
 ARGS ?=
 RESULTS ?=
-WORKERS ?= 2
+# One more than the cores of a small machine, because some tests wait.
+WORKERS ?= 3
 EXAMPLES ?= 2000
 FUZZED := tests/readers/test_readers.py tests/readers/test_readers_of_runs.py tests/readers/test_reader_bounds.py tests/readers/test_mathematical_properties.py
 PYTHON ?= >=3.11,<3.14

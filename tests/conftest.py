@@ -168,7 +168,23 @@ def group_of(nodeid: str) -> str:
     return names[0] if names else SHARED.get(file, file)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+SLOW_TESTS = Path(__file__).with_name("slow_tests.txt")
+
+
+@pytest.hookimpl(tryfirst=True)  # before slow tests are left out
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the slow tests of slow_tests.txt, and order all tests by `FIRST`."""
+    by_name = {item.nodeid.removeprefix("tests/"): item for item in items}
+    lines = [line for line in SLOW_TESTS.read_text().splitlines() if line and not line.startswith("#")]
+    slow, faster = zip(*(line.split(" <- ") for line in lines), strict=True)
+    for name in slow:
+        if name in by_name:
+            by_name[name].add_marker(pytest.mark.slow)
+    if config.args == config.getini("testpaths"):  # all tests are here
+        for name in (*slow, *faster):
+            if name not in by_name or (name in faster and by_name[name].get_closest_marker("slow")):
+                raise pytest.UsageError(f"{SLOW_TESTS.name}: {name} is not a test, or is itself slow: correct its line")
+
     def rank(item: pytest.Item) -> int:
         group = group_of(item.nodeid)
         return FIRST.index(group) if group in FIRST else len(FIRST)

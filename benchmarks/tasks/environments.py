@@ -20,8 +20,6 @@ from jaxrl_vis_envs.base import State
 from jaxrl_vis_envs.compiling.compilation import compiler_options
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.tasks.fetch_push import FetchPush
-from jaxrl_vis_envs.tasks.fetch_reach import FetchReach
-from jaxrl_vis_envs.tasks.stalk_reach import StalkReach
 
 LANES = 16
 
@@ -74,9 +72,9 @@ def _reset_program(env: Any) -> Callable:
 @functools.cache
 def _advance_program(env: Any) -> Callable:
     options = compiler_options()
-    if jax.default_backend() == "cpu" and isinstance(env, FetchPush | FetchReach | StalkReach):
-        # Their steps run so long that optimising the code pays even in tests, whose flags turn it off; optimising it further
-        # does not make it faster.
+    if jax.default_backend() == "cpu" and isinstance(env, FetchPush):
+        # Its steps run so long that optimising the code pays even in tests, whose flags turn it off; optimising it further does
+        # not make it faster.
         options["xla_backend_optimization_level"] = 1
     return jax.jit(jax.vmap(env.advance), compiler_options=options)
 

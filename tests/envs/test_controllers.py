@@ -6,13 +6,13 @@ from benchmarks.tasks import controllers
 
 EPISODES = {
     "FetchPush": 32,
-    "FetchReach": 24,
+    "FetchReach": 16,
     "FingerTurn": 6,
     "HandReach": 16,
     "PointMass": 64,
     "Reacher": 64,
     "SawyerReach": 64,
-    "StalkReach": 64,
+    "StalkReach": 16,
 }
 
 

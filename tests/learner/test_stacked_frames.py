@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import point_mass
 import pytest
 from learners import rollout, train_iteration
 from probe_environments import Probe
@@ -59,13 +60,14 @@ def test_relabelled_goals_repeat_the_achieved_image():
 
 def test_stacked_images_from_replay_equal_rendered_ones():
     """Episodes render the preceding images again, from joint positions; the replay uses its stored ones. They are equal."""
-    config = preset("debug", env="VisualReacher", frame_stack=3, pixels="rgbd", **SETTINGS | {"image_size": 16})
-    made = train_step.make_train_step(make_env(config), config)
+    with point_mass.registered():
+        config = preset("debug", env="VisualPoint", frame_stack=3, pixels="rgbd", **SETTINGS | {"image_size": 16})
+        made = train_step.make_train_step(make_env(config), config)
     episodes, _ = rollout(made, made.init(jax.random.key(0)[None]).train, jax.random.key(1)[None])
     episodes = jax.tree.map(lambda leaf: leaf[0], episodes)
     seen = np.asarray(episodes.observations)
     assert seen.shape == (ENVS, made.env.horizon + 2, 12, 16, 16)
-    assert np.any(seen[:, 1:-1, :4] != seen[:, 1:-1, 4:8], axis=(2, 3, 4)).mean() > 0.5  # the arm moves
+    assert np.any(seen[:, 1:-1, :4] != seen[:, 1:-1, 4:8], axis=(2, 3, 4)).mean() > 0.5  # the ball moves
     np.testing.assert_array_equal(made.replay.stacked(made.replay.of_rollout(episodes)), seen)
 
 
