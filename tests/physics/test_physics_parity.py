@@ -49,7 +49,7 @@ def test_most_of_the_fetch_recordings_count(name):
     assert measures["share of the recording that counts (near the start)"] > 0.5
 
 
-def test_pushes_that_move_nothing_are_found_out():
+def test_fetch_pushes_that_move_nothing_are_found_out():
     with np.load(DATA / "fetch_push.npz") as recording:
         still = {key: recording[key][:PUSHES] for key in ("actions", "observations")}
     still["observations"][:, :, 3:6] = still["observations"][:, :1, 3:6]
@@ -70,7 +70,7 @@ def test_a_step_of_the_push():
     assert np.median(multiples) < 0.1 and (multiples <= 1.0).mean() > 0.85
 
 
-def test_a_box_that_is_pushed_off_the_table_lies_on_the_floor():
+def test_a_box_that_fetch_pushes_off_the_table_lies_on_the_floor():
     env = environments.make("FetchPush")
     begin, _ = parity.push_programs(env)
     # On the table, half over its edge, mostly over it, beside it.
