@@ -100,7 +100,8 @@ clean: ## Remove what make built (not runs/)
 
 # dev holds all of gpu but CUDA, at the same versions, so that either may follow the other. base has an older JAX
 # (requirements/cpu.in), which dev gives way to where there is no GPU.
-INSTALL = $(UV) pip install --quiet --compile-bytecode --python .venv --require-hashes
+# Packages are compiled at once, except those of dev, most of which no test imports.
+INSTALL = $(UV) pip install --quiet $(if $(filter-out dev,$*),--compile-bytecode) --python .venv --require-hashes
 $(STAMPS)/dev: requirements/base.txt
 $(STAMPS)/%: requirements/%.txt pyproject.toml | .venv/bin/python
 	@echo "installing requirements/$*.txt into .venv/"
