@@ -100,7 +100,7 @@ clean: ## Remove what make built (not runs/)
 
 # dev holds all of gpu but CUDA, at the same versions, so that either may follow the other. base has an older JAX
 # (requirements/cpu.in), which dev gives way to where there is no GPU.
-# Packages are compiled at once, except those of dev, most of which no test imports.
+# Installation compiles bytecode, but not for dev, most of whose packages no test imports.
 INSTALL = $(UV) pip install --quiet $(if $(filter-out dev,$*),--compile-bytecode) --python .venv --require-hashes
 $(STAMPS)/dev: requirements/base.txt
 $(STAMPS)/%: requirements/%.txt pyproject.toml | .venv/bin/python

@@ -171,19 +171,28 @@ def group_of(nodeid: str) -> str:
 SLOW_TESTS = Path(__file__).with_name("slow_tests.txt")
 
 
-@pytest.hookimpl(tryfirst=True)  # before slow tests are left out
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the slow tests of slow_tests.txt, and order all tests by `FIRST`."""
+def mark_slow_tests(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the tests that slow_tests.txt lists as slow.
+
+    Raises:
+        pytest.UsageError: All tests are collected, and a line names something else, or a slow test as the faster one.
+    """
     by_name = {item.nodeid.removeprefix("tests/"): item for item in items}
     lines = [line for line in SLOW_TESTS.read_text().splitlines() if line and not line.startswith("#")]
-    slow, faster = zip(*(line.split(" <- ") for line in lines), strict=True)
-    for name in slow:
-        if name in by_name:
-            by_name[name].add_marker(pytest.mark.slow)
-    if config.args == config.getini("testpaths"):  # all tests are here
-        for name in (*slow, *faster):
-            if name not in by_name or (name in faster and by_name[name].get_closest_marker("slow")):
-                raise pytest.UsageError(f"{SLOW_TESTS.name}: {name} is not a test, or is itself slow: correct its line")
+    pairs = [line.partition(" <- ")[::2] for line in lines]
+    for slow, _ in pairs:
+        if slow in by_name:
+            by_name[slow].add_marker(pytest.mark.slow)
+    if config.args != config.getini("testpaths"):
+        return
+    for slow, faster in pairs:
+        if slow not in by_name or faster not in by_name or by_name[faster].get_closest_marker("slow"):
+            raise pytest.UsageError(f"{SLOW_TESTS.name}: correct `{slow} <- {faster}`: one is no test, or the faster is slow")
+
+
+@pytest.hookimpl(tryfirst=True)  # before slow tests are left out
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    mark_slow_tests(config, items)
 
     def rank(item: pytest.Item) -> int:
         group = group_of(item.nodeid)
